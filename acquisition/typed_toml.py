@@ -1,7 +1,7 @@
 """Typed TOML: a file of tables read into a tree of frozen dataclasses, every mistake named where it stands.
 
-A table is a dataclass, a key is a field. Field types: `bool`, `int`, `float`, `str`, `Literal[...]`, fixed and
-variable-length tuples of these, another dataclass (a table), and any of them `| None` (absent means `None`).
+A table is a dataclass, a key is a field. Field types: `bool`, `int`, `float`, `str`, `Literal[...]`, fixed
+and variable-length tuples of these, another dataclass (a table), and any of them `| None` (absent: `None`).
 A dataclass refuses values out of range by raising `ToolkitError` in `__post_init__`; the reader adds file and
 table.
 """

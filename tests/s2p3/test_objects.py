@@ -1,0 +1,120 @@
+"""Objects: watertight, metric, symmetric as declared; bad meshes refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from dataset import ToolkitError
+from s2p3 import object_meshes, objects
+
+
+@pytest.mark.parametrize(
+    ("name", "diameter", "index"),
+    [("cup", 0.1387, 1.50), ("fork", 0.1892, 2.75), ("knife", 0.2309, 2.75), ("bottle", 0.1397, 1.52)],
+)
+def test_built_in_objects_have_the_published_size_and_index(name: str, diameter: float, index: float) -> None:
+    model = objects.build(name)
+    assert objects.diameter(model.vertices) == pytest.approx(diameter, rel=1e-9)
+    assert model.diameter == diameter
+    assert model.refractive_index == index
+    assert model.extinction == 0.0
+
+
+@pytest.mark.parametrize("name", objects.NAMES)
+def test_built_in_objects_are_closed_centred_and_of_moderate_size(name: str) -> None:
+    model = objects.build(name)
+    mesh = trimesh.Trimesh(model.vertices, model.faces, process=False)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.volume > 0
+    assert len(mesh.split(only_watertight=False)) == 1
+    np.testing.assert_allclose(model.vertices.min(axis=0) + model.vertices.max(axis=0), 0.0, atol=1e-12)
+    assert 3000 <= len(model.faces) <= 18000
+
+
+def test_the_cup_has_one_handle_and_the_bottle_is_hollow() -> None:
+    cup, bottle = objects.build("cup"), objects.build("bottle")
+    assert trimesh.Trimesh(cup.vertices, cup.faces, process=False).euler_number == 0
+    assert cup.vertices[:, 0].max() > 0.0  # the handle, towards +x
+    wall = trimesh.Trimesh(bottle.vertices, bottle.faces, process=False)
+    assert wall.volume < 0.4 * wall.convex_hull.volume
+
+
+def test_the_resting_pose_puts_the_lowest_point_on_the_table() -> None:
+    for name in objects.NAMES:
+        model = objects.build(name)
+        assert model.resting.apply(model.vertices)[:, 2].min() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_declared_symmetries_map_the_surface_onto_itself() -> None:
+    bottle = objects.build("bottle")
+    tree = cKDTree(bottle.surface_points(60000, seed=1))
+    points = bottle.surface_points(500, seed=2)
+    for turned in bottle.symmetry.sampled(5):
+        distance, _ = tree.query(points @ turned[:3, :3].T)
+        assert np.quantile(distance, 0.99) < 0.0015
+    assert bottle.symmetry.any
+    assert not any(objects.build(name).symmetry.any for name in ("cup", "fork", "knife"))
+
+
+def test_symmetry_survives_json() -> None:
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    symmetry = objects.Symmetry(half_turn[None], np.array([0.0, 0.0, 1.0]))
+    again = objects.Symmetry.from_json(symmetry.to_json())
+    np.testing.assert_array_equal(again.transforms, symmetry.transforms)
+    assert again.axis is not None
+    np.testing.assert_array_equal(again.axis, [0.0, 0.0, 1.0])
+    assert not objects.Symmetry.from_json("").any
+    with pytest.raises(ToolkitError, match="symmetries_discrete"):
+        objects.Symmetry.from_json("[1, 2]")
+
+
+def test_surface_points_are_reproducible_and_on_the_surface() -> None:
+    cup = objects.build("cup")
+    points = cup.surface_points(200, seed=3)
+    np.testing.assert_array_equal(points, cup.surface_points(200, seed=3))
+    mesh = trimesh.Trimesh(cup.vertices, cup.faces, process=False)
+    assert trimesh.proximity.closest_point(mesh, points)[1].max() < 1e-9
+
+
+def _export(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "stl"])
+def test_load_reads_back_what_was_exported(tmp_path: Path, suffix: str) -> None:
+    vertices, faces = object_meshes.box((0.1, 0.05, 0.02))
+    model = objects.load(_export(tmp_path / f"block.{suffix}", vertices, faces), refractive_index=1.4)
+    assert (model.name, model.refractive_index, len(model.faces)) == ("block", 1.4, 12)
+    assert model.diameter == pytest.approx(np.linalg.norm([0.1, 0.05, 0.02]), rel=1e-5)
+
+
+def test_load_turns_an_inside_out_mesh(tmp_path: Path) -> None:
+    vertices, faces = object_meshes.box((0.1, 0.05, 0.02))
+    model = objects.load(_export(tmp_path / "inside_out.ply", vertices, faces[:, ::-1]))
+    assert trimesh.Trimesh(model.vertices, model.faces, process=False).volume > 0
+
+
+def test_load_refuses_bad_meshes_in_one_line_that_names_the_fix(tmp_path: Path) -> None:
+    vertices, faces = object_meshes.box((0.1, 0.05, 0.02))
+    garbage = tmp_path / "garbage.ply"
+    garbage.write_bytes(b"not a mesh")
+    cases = [
+        (_export(tmp_path / "open.ply", vertices, faces[1:]), "not watertight .3 open edges"),
+        (_export(tmp_path / "large.ply", vertices * 1000, faces), "millimetres"),
+        (tmp_path / "missing.ply", "no such mesh file"),
+        (garbage, "cannot be read"),
+    ]
+    for path, pattern in cases:
+        with pytest.raises(ToolkitError, match=pattern) as caught:
+            objects.load(path)
+        assert "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
+    with pytest.raises(ToolkitError, match="spoon"):
+        objects.build("spoon")

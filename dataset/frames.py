@@ -12,6 +12,9 @@ from dataset.transforms import SE3
 
 Mosaic = Literal["mono", "colour"]
 
+SUPERPIXEL: dict[Mosaic, int] = {"mono": 2, "colour": 4}
+"""Side of the smallest block that holds every polarizer angle (and colour) once, pixels."""
+
 
 @dataclass(frozen=True)
 class CameraInfo:
@@ -35,6 +38,12 @@ class CameraInfo:
     height: int
     bits: int
     packet_size: int
+
+    @property
+    def working_size(self) -> tuple[int, int]:
+        """(h, w) of the polarization image, one pixel per super-pixel."""
+        size = SUPERPIXEL[self.mosaic]
+        return self.height // size, self.width // size
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataset.errors import ToolkitError
-from dataset.frames import Mosaic
+from dataset.frames import SUPERPIXEL, Mosaic
 from dataset.mosaic_kernels import colour_stokes, mono_stokes, sample_stokes
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
@@ -31,7 +31,6 @@ SATURATED = 0.995
 DARK = 0.01
 """S0 under which polarization is noise (our choice: half a percent of the white level per pixel)."""
 
-_SUPERPIXEL: dict[Mosaic, int] = {"mono": 2, "colour": 4}
 _SITES = [
     next((row, column) for row in range(2) for column in range(2) if POLARIZER_CELL[row][column] == angle)
     for angle in ANGLES_DEG
@@ -95,9 +94,9 @@ class Stokes:
 
 def superpixel(layout: Mosaic) -> int:
     """Side of the smallest block that holds every angle (and colour) once: 2 or 4 pixels."""
-    size = _SUPERPIXEL.get(layout)
+    size = SUPERPIXEL.get(layout)
     if size is None:
-        raise ToolkitError(f"mosaic layout {layout!r} is unknown; use one of {', '.join(_SUPERPIXEL)}")
+        raise ToolkitError(f"mosaic layout {layout!r} is unknown; use one of {', '.join(SUPERPIXEL)}")
     return size
 
 

@@ -1,0 +1,198 @@
+"""Adding to a finished session what was computed from it: calibration, objects, poses, splits."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dataset.compression import compress
+from dataset.errors import SessionError
+from dataset.frames import SUPERPIXEL
+from dataset.intrinsics import Intrinsics
+from dataset.schema import declaration
+from dataset.session.files import dtype_of, make_dataset, open_for_editing
+from dataset.session.records import ObjectPoses, ObjectRecord
+from dataset.transforms import SE3
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]*")
+
+
+def write_calibration(path: str | Path, json_text: str, intrinsics: Intrinsics) -> None:
+    """Stores the calibration that was applied, replacing an earlier one.
+
+    Args:
+        path: of a complete session.
+        json_text: the whole calibration.json, kept verbatim with its sha256.
+        intrinsics: at the mosaic's grid.
+
+    Raises:
+        SessionError: the file cannot be edited, or the intrinsics are for another image size.
+    """
+    path = Path(path)
+    with open_for_editing(path) as file:
+        size = _mosaic_size(file)
+        if (intrinsics.height, intrinsics.width) != size:
+            raise SessionError(
+                f"{path}: the intrinsics are for {intrinsics.width}x{intrinsics.height} pixels, the mosaic "
+                f"has {size[1]}x{size[0]}; calibrate at the mosaic's resolution"
+            )
+        if "calibration" in file:
+            del file["calibration"]
+        store_intrinsics(file, intrinsics)
+        declared = declaration("calibration/json")
+        make_dataset(file, declared, declared.path, json_text, (), dtype_of(declared))
+        file["calibration"].attrs["sha256"] = hashlib.sha256(json_text.encode()).hexdigest()
+
+
+def write_object(path: str | Path, record: ObjectRecord) -> None:
+    """Stores an object's mesh and material, replacing one of the same name.
+
+    Raises:
+        SessionError: the file cannot be edited, the name is not a plain word, or the arrays are no mesh.
+    """
+    with open_for_editing(Path(path)) as file:
+        store_object(file, record)
+
+
+def write_poses(
+    path: str | Path,
+    T_base_cam: SE3,
+    sigma_t: ArrayLike,
+    sigma_r: ArrayLike,
+    objects: Mapping[str, ObjectPoses],
+) -> None:
+    """Stores the camera's and the objects' poses of every frame, replacing earlier ones.
+
+    Args:
+        path: of a complete session with N frames.
+        T_base_cam: N camera poses at mid-exposure; NaN where unknown.
+        sigma_t: metres, one number or (N,).
+        sigma_r: radians, one number or (N,).
+        objects: by name; each must be among the session's objects.
+
+    Raises:
+        SessionError: the file cannot be edited, sizes differ from the session's, or an object is unknown.
+    """
+    path = Path(path)
+    with open_for_editing(path) as file:
+        count = len(file["camera/raw"])
+        _require(path, "T_base_cam", T_base_cam.batch, (count,))
+        for name, poses in objects.items():
+            if f"objects/{name}" not in file:
+                raise SessionError(f"{path} holds no object {name!r}; store its mesh first with write_object")
+            _require(path, f"T_cam_obj of {name}", poses.T_cam_obj.batch, (count,))
+            _require(path, f"visible_fraction of {name}", np.shape(poses.visible_fraction), (count,))
+            _require(path, f"bbox_xywh of {name}", np.shape(poses.bbox_xywh), (count, 4))
+            _require(path, f"masks of {name}", (len(poses.masks),), (count,))
+        if "poses" in file:
+            del file["poses"]
+        _store(file, "poses/T_base_cam", T_base_cam.as_matrix())
+        _store(file, "poses/sigma_t", np.broadcast_to(sigma_t, (count,)))
+        _store(file, "poses/sigma_r", np.broadcast_to(sigma_r, (count,)))
+        for name, poses in objects.items():
+            _store_object_poses(file, path, name, poses)
+
+
+def write_split(path: str | Path, name: str, indices: ArrayLike) -> None:
+    """Stores a named split, replacing one of the same name.
+
+    Args:
+        path: of a complete session.
+        name: such as "train".
+        indices: frame indices; stored in increasing order.
+
+    Raises:
+        SessionError: the file cannot be edited, an index is repeated or out of range.
+    """
+    path = Path(path)
+    _check_name(name)
+    with open_for_editing(path) as file:
+        count = len(file["camera/raw"])
+        chosen = np.sort(np.asarray(indices, dtype=np.int64).ravel())
+        if len(chosen) and (chosen[0] < 0 or chosen[-1] >= count):
+            raise SessionError(f"{path}: split {name!r} names frames outside 0..{count - 1}")
+        if np.any(np.diff(chosen) == 0):
+            raise SessionError(f"{path}: split {name!r} names a frame twice")
+        if f"splits/{name}" in file:
+            del file[f"splits/{name}"]
+        make_dataset(file, declaration("splits/*"), f"splits/{name}", chosen, chosen.shape, np.int64)
+
+
+def store_intrinsics(file: h5py.File, intrinsics: Intrinsics) -> None:
+    """Writes /calibration/K and distortion into an open file."""
+    _store(file, "calibration/K", intrinsics.K)
+    _store(file, "calibration/distortion", intrinsics.distortion)
+
+
+def store_object(file: h5py.File, record: ObjectRecord) -> None:
+    """Writes /objects/<name> into an open file, replacing one of the same name."""
+    _check_name(record.name)
+    vertices, faces = np.asarray(record.vertices), np.asarray(record.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise SessionError(
+            f"object {record.name}: vertices {vertices.shape} and faces {faces.shape} are no triangle mesh; "
+            "give (V, 3) and (F, 3)"
+        )
+    if f"objects/{record.name}" in file:
+        del file[f"objects/{record.name}"]
+    for part, data, dtype in (("vertices", vertices, "<f8"), ("faces", faces, "<i4")):
+        declared = declaration(f"objects/*/{part}")
+        make_dataset(file, declared, f"objects/{record.name}/{part}", data, data.shape, dtype)
+    file[f"objects/{record.name}"].attrs.update(
+        {
+            "material": record.material,
+            "refractive_index": float(record.refractive_index),
+            "extinction": float(record.extinction),
+            "symmetry": record.symmetry,
+            "diameter": float(record.diameter),
+            "sha256": record.sha256,
+        }
+    )
+
+
+def _store_object_poses(file: h5py.File, path: Path, name: str, poses: ObjectPoses) -> None:
+    columns = (
+        ("T_cam_obj", poses.T_cam_obj.as_matrix()),
+        ("visible_fraction", poses.visible_fraction),
+        ("bbox_xywh", poses.bbox_xywh),
+    )
+    for part, data in columns:
+        _store(file, f"poses/objects/*/{part}", data, name)
+    block = SUPERPIXEL[file["camera"].attrs["mosaic"]]
+    height, width = _mosaic_size(file)
+    size = (height // block, width // block)
+    count = len(poses.masks)
+    declared = declaration("poses/objects/*/mask")
+    stored = make_dataset(file, declared, f"poses/objects/{name}/mask", None, (count, *size), np.uint8)
+    for i in range(count):
+        mask = poses.mask(i)
+        _require(path, f"mask {i} of {name}", mask.shape, size)
+        stored.id.write_direct_chunk((i, 0, 0), compress(mask.view(np.uint8)).data)
+
+
+def _store(file: h5py.File, declared_path: str, data: ArrayLike, name: str = "") -> None:
+    data = np.asarray(data, dtype=np.float64)
+    make_dataset(
+        file, declaration(declared_path), declared_path.replace("*", name), data, data.shape, np.float64
+    )
+
+
+def _mosaic_size(file: h5py.File) -> tuple[int, int]:
+    attrs = file["camera"].attrs
+    return int(attrs["height"]), int(attrs["width"])
+
+
+def _check_name(name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise SessionError(f"the name {name!r} may hold only letters, digits, '_', '-' and '.'")
+
+
+def _require(path: Path, what: str, found: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    if tuple(found) != expected:
+        raise SessionError(f"{path}: {what} has shape {tuple(found)}, the session needs {expected}")

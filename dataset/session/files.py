@@ -1,0 +1,166 @@
+"""Opening and laying out session files: the only place that calls `h5py.File`.
+
+A recording grows in HDF5's single-writer-multiple-readers mode, in which the file on disk is consistent at
+every moment, so that a process killed at any instant leaves what it had flushed.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dataset.compression import filter_options
+from dataset.errors import SessionError
+from dataset.schema import DROP_DTYPE, FORMAT, MAJOR, VERSION, Dataset
+
+LIBVER = ("v110", "v110")
+"""File format of HDF5 1.10: the oldest with single-writer-multiple-readers, readable by everything since."""
+
+
+def create(path: Path) -> h5py.File:
+    """A new empty file.
+
+    Raises:
+        SessionError: the path exists or cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return h5py.File(path, "x", libver=LIBVER)
+    except FileExistsError as error:
+        raise SessionError(f"{path} already exists; choose another name or remove it first") from error
+    except OSError as error:
+        raise SessionError(
+            f"{path} cannot be created ({error}); check the folder and its permissions"
+        ) from error
+
+
+def open_for_reading(path: Path) -> tuple[h5py.File, bool]:
+    """Opens a session, and says whether it was left open by its writer (still recording, or killed).
+
+    Raises:
+        SessionError: missing, not HDF5, damaged, not a session, or of a newer major version.
+    """
+    try:
+        file, unfinished = h5py.File(path, "r"), False
+    except OSError as error:
+        if "already open for write" not in str(error):
+            raise _explained(path, error) from error
+        try:
+            file, unfinished = h5py.File(path, "r", libver=LIBVER, swmr=True), True
+        except OSError as swmr_error:
+            raise SessionError(
+                f"{path} is being changed by another program, or one was killed while changing it; "
+                f"close that program, or run: s2p3 dataset repair {path}"
+            ) from swmr_error
+    try:
+        check_format(path, file)
+    except SessionError:
+        file.close()
+        raise
+    return file, unfinished
+
+
+@contextmanager
+def open_for_editing(path: Path) -> Iterator[h5py.File]:
+    """Opens a finished session for adding to it; the file is closed, hence consistent, on leaving.
+
+    Raises:
+        SessionError: as `open_for_reading`, or the recording is incomplete.
+    """
+    file, unfinished = open_for_reading(path)
+    complete = not unfinished and bool(file.attrs.get("complete", False))
+    file.close()
+    if not complete:
+        raise SessionError(f"{path} is incomplete; run first: s2p3 dataset repair {path}")
+    try:
+        file = h5py.File(path, "r+", libver=LIBVER)
+    except OSError as error:
+        raise _explained(path, error) from error
+    with file:
+        yield file
+
+
+def check_format(path: Path, file: h5py.File) -> None:
+    """Refuses a file that is no session, or of a schema newer than this toolkit.
+
+    Raises:
+        SessionError: with what was found.
+    """
+    found = attribute(file, "format")
+    if found != FORMAT:
+        raise SessionError(
+            f"{path} is HDF5 but no session: its format attribute is {found!r}, expected {FORMAT!r}; "
+            "convert it with: s2p3 dataset import"
+        )
+    version = str(attribute(file, "schema"))
+    major = version.split(".")[0]
+    if not major.isdigit():
+        raise SessionError(f"{path}: the schema version {version!r} is not MAJOR.MINOR; the file is damaged")
+    if int(major) > MAJOR:
+        raise SessionError(
+            f"{path} has schema {version}, this toolkit reads up to {VERSION}; upgrade the toolkit to open it"
+        )
+
+
+def attribute(node: h5py.Group, name: str) -> Any:
+    """An attribute as a plain Python value; None where it is absent."""
+    value = node.attrs.get(name)
+    if isinstance(value, bytes):
+        return value.decode(errors="replace")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def make_dataset(
+    file: h5py.File, declared: Dataset, path: str, data: ArrayLike | None, shape: tuple[int, ...], dtype: Any
+) -> h5py.Dataset:
+    """Creates a dataset as the schema declares it, with its units and description.
+
+    Args:
+        file: open for writing.
+        declared: its declaration; a dataset with `chunk` rows may grow along its first axis.
+        path: where, with the `*` of the declaration filled in.
+        data: the initial content, or None.
+        shape, dtype: of the content.
+    """
+    options: dict[str, Any] = {}
+    if declared.chunk:
+        options = {"maxshape": (None, *shape[1:]), "chunks": (declared.chunk, *shape[1:])}
+    if declared.compressed:
+        options.update(filter_options())
+    dataset = file.create_dataset(path, shape=shape, dtype=dtype, data=data, **options)
+    dataset.attrs["units"] = declared.units
+    dataset.attrs["description"] = declared.description
+    return dataset
+
+
+def dtype_of(declared: Dataset) -> Any:
+    """The dtype h5py should use for a declared dataset with one possible type."""
+    kind = declared.dtypes[0]
+    if kind == "drop":
+        return np.dtype(DROP_DTYPE)
+    return h5py.string_dtype() if kind == "text" else np.dtype("<" + kind)
+
+
+def _explained(path: Path, error: OSError) -> SessionError:
+    message = str(error)
+    if isinstance(error, FileNotFoundError) or not path.exists():
+        return SessionError(f"{path} does not exist; check the path")
+    if path.is_dir():
+        return SessionError(f"{path} is a folder; name one session file in it")
+    if isinstance(error, PermissionError):
+        return SessionError(f"{path} may not be opened ({error.strerror}); check its permissions")
+    if error.errno in (errno.EAGAIN, errno.EACCES) or "unable to lock file" in message:
+        return SessionError(f"{path} is in use by another program; wait for it or close it")
+    if "file signature not found" in message:
+        return SessionError(f"{path} is not an HDF5 file, so no session; check the path")
+    return SessionError(
+        f"{path} is damaged or truncated ({message.splitlines()[0]}); copy it again from its source, "
+        f"or save what is left with: s2p3 dataset repair {path}"
+    )

@@ -1,0 +1,80 @@
+"""What a session holds besides frames: objects, their poses, and clock fits."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataset.frames import ClockFit
+from dataset.transforms import SE3
+
+
+class Masks(Protocol):
+    """N visible masks, read one at a time: a (N, h, w) array, a list of images, or masks in a file."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> NDArray[np.bool_]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectRecord:
+    """An object as a session stores it.
+
+    Attributes:
+        name: a file-system-safe word.
+        vertices: (V, 3) float64 in the object frame, metres.
+        faces: (F, 3) int32, counter-clockwise seen from outside.
+        material: its name.
+        refractive_index, extinction: real and imaginary part of the refractive index.
+        symmetry: JSON text.
+        diameter: largest distance between two vertices, metres.
+    """
+
+    name: str
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    material: str
+    refractive_index: float
+    extinction: float
+    symmetry: str
+    diameter: float
+
+    @property
+    def sha256(self) -> str:
+        """Of the vertices' bytes (float64) followed by the faces' (int32)."""
+        vertices = np.ascontiguousarray(self.vertices, dtype="<f8").tobytes()
+        return hashlib.sha256(vertices + np.ascontiguousarray(self.faces, dtype="<i4").tobytes()).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPoses:
+    """One object in every frame of a session, in the undistorted polarization image.
+
+    Attributes:
+        T_cam_obj: a batch of N; NaN where unknown.
+        visible_fraction: (N,) float64 in [0, 1], share of the silhouette that is visible.
+        bbox_xywh: (N, 4) float64, box of the visible mask in pixel-edge coordinates; zeros where empty.
+        masks: N visible masks, each (h, w) bool.
+    """
+
+    T_cam_obj: SE3
+    visible_fraction: NDArray[np.float64]
+    bbox_xywh: NDArray[np.float64]
+    masks: Masks
+
+    def mask(self, index: int) -> NDArray[np.bool_]:
+        """(h, w) bool: where frame `index` shows the object."""
+        return np.asarray(self.masks[index], dtype=bool)
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """The devices' clocks on the host's; None where not fitted."""
+
+    camera: ClockFit | None
+    robot: ClockFit | None

@@ -1,0 +1,259 @@
+"""Recording a session so that no accident loses what was already captured."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dataset.compression import Chunk, compress
+from dataset.errors import SessionError
+from dataset.frames import SUPERPIXEL, CameraInfo, ClockFit, RawFrame, RobotTrace
+from dataset.intrinsics import Intrinsics
+from dataset.schema import (
+    CAMERA_ATTRIBUTES,
+    DROP_DTYPE,
+    FORMAT,
+    FRAME_COLUMNS,
+    KINDS,
+    ROBOT_COLUMNS,
+    VERSION,
+    Kind,
+    declaration,
+)
+from dataset.session.edit import store_intrinsics, store_object
+from dataset.session.files import LIBVER, create, dtype_of, make_dataset
+from dataset.session.records import ObjectRecord
+
+
+class SessionWriter:
+    """Writes one session file. A context manager: a clean exit marks the file complete, an exception (Ctrl-C
+    included) leaves it closed and marked incomplete.
+
+    Every frame is on its way to the disk when `add_frame` returns: a killed process loses none of them.
+    Methods may be called from several threads.
+
+    Args:
+        path: of the new file; missing folders are made.
+        kind: what is being recorded.
+        camera: its description, which every frame must fit.
+        rig_toml: the rig's description, kept for the record.
+        intrinsics: at the mosaic's grid, where they are known already (synthetic sessions).
+
+    Raises:
+        SessionError: the path exists, the kind is unknown, or the camera's image is not whole super-pixels.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        kind: Kind,
+        camera: CameraInfo,
+        *,
+        rig_toml: str = "",
+        intrinsics: Intrinsics | None = None,
+    ) -> None:
+        if kind not in KINDS:
+            raise SessionError(f"session kind {kind!r} is unknown; use one of {', '.join(KINDS)}")
+        block = SUPERPIXEL[camera.mosaic]
+        if camera.height % block or camera.width % block:
+            raise SessionError(
+                f"a {camera.mosaic} mosaic of {camera.width}x{camera.height} pixels is not whole "
+                f"super-pixels; set the camera's width and height to multiples of {block}"
+            )
+        self.path = Path(path)
+        self.camera = camera
+        self._lock = threading.RLock()
+        self._dtype = np.dtype(np.uint8 if camera.bits <= 8 else np.uint16)
+        self._frames = self._samples = self._drops = 0
+        self._last_id: int | None = None
+        self._file: h5py.File | None = create(self.path)
+        _lay_out(self._file, kind, camera, rig_toml, self._dtype)
+        if intrinsics is not None:
+            store_intrinsics(self._file, intrinsics)
+        self._file.swmr_mode = True
+
+    def __enter__(self) -> SessionWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.finish()
+            return
+        with suppress(SessionError):  # the error on its way out is the one the user must see
+            self.close()
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def add_frame(self, frame: RawFrame, chunk: Chunk | None = None) -> int:
+        """Appends a frame and returns its index.
+
+        Args:
+            frame: with an id larger than every one before.
+            chunk: `compress(frame.pixels)` where another thread has done it already.
+
+        Raises:
+            SessionError: the frame does not fit the camera, its id does not grow, or the disk refuses it.
+        """
+        expected = (self.camera.height, self.camera.width)
+        if frame.pixels.shape != expected or frame.pixels.dtype != self._dtype:
+            raise SessionError(
+                f"{self.path}: frame {frame.frame_id} is {frame.pixels.shape} {frame.pixels.dtype}, the "
+                f"camera was described as {expected} {self._dtype}; open the camera anew after "
+                "changing its format"
+            )
+        chunk = chunk if chunk is not None else compress(frame.pixels)
+        with self._writing(f"frame {frame.frame_id}") as file:
+            if self._last_id is not None and frame.frame_id <= self._last_id:
+                raise SessionError(
+                    f"{self.path}: frame id {frame.frame_id} follows {self._last_id}; unwrap the camera's "
+                    "counter and hand frames over in order"
+                )
+            index = self._frames
+            raw = file["camera/raw"]
+            raw.resize(index + 1, axis=0)
+            raw.id.write_direct_chunk((index, 0, 0), chunk.data)
+            _put(file["camera/crc32"], index, [chunk.crc32])
+            for name in FRAME_COLUMNS:
+                _put(file[f"camera/{name}"], index, [getattr(frame, name)])
+            file.flush()
+            self._frames, self._last_id = index + 1, frame.frame_id
+        return index
+
+    def add_drop(self, frame_id: int, reason: str, host_time_ns: int) -> None:
+        """Enters a frame into the ledger of those that were exposed and not stored.
+
+        `reason` keeps its first 64 bytes.
+        """
+        row = np.array([(frame_id, reason.encode()[:64], host_time_ns)], dtype=DROP_DTYPE)
+        with self._writing(f"the drop of frame {frame_id}") as file:
+            _put(file["camera/drops"], self._drops, row)
+            file.flush()
+            self._drops += 1
+
+    def add_robot_trace(self, trace: RobotTrace, tcp_offset: ArrayLike) -> None:
+        """Appends robot samples; call it once at the end, or again and again with what is new.
+
+        Args:
+            trace: M samples.
+            tcp_offset: (6,) flange<-tcp as [x y z rx ry rz], metres and rotation vector.
+        """
+        with self._writing("the robot trace") as file:
+            file["robot/tcp_offset"][:] = np.asarray(tcp_offset, dtype=np.float64)
+            for name in ROBOT_COLUMNS:
+                _put(file[f"robot/{name}"], self._samples, getattr(trace, name))
+            file.flush()
+            self._samples += len(trace)
+
+    def set_clocks(self, camera: ClockFit | None = None, robot: ClockFit | None = None) -> None:
+        """Stores clock fits; a later call replaces what it gives."""
+        with self._writing("the clock fits") as file:
+            for name, fit in (("camera", camera), ("robot", robot)):
+                if fit is not None:
+                    file[f"clocks/{name}"][:] = [fit.a_ns, fit.b, fit.sigma_ns]
+            file.flush()
+
+    def add_object(self, record: ObjectRecord) -> None:
+        """Stores an object's mesh and material.
+
+        Raises:
+            SessionError: its name is not a plain word, or its arrays are no mesh.
+        """
+        with self._writing(f"object {record.name}") as file:
+            # a file being read while it grows may get no new groups: leave that mode for a moment
+            file.close()
+            with h5py.File(self.path, "r+", libver=LIBVER) as editable:
+                store_object(editable, record)
+            self._file = h5py.File(self.path, "r+", libver=LIBVER)
+            self._file.swmr_mode = True
+
+    def finish(self) -> None:
+        """Marks the file complete and closes it; nothing may be added afterwards."""
+        with self._writing("the end of the file") as file:
+            file.attrs["complete"] = True
+            file.flush()
+        self.close()
+
+    def close(self) -> None:
+        """Closes the file as it is: incomplete unless `finish` came first.
+
+        Raises:
+            SessionError: the disk refuses the last bytes.
+        """
+        with self._lock:
+            file, self._file = self._file, None
+            if file is None:
+                return
+            try:
+                file.close()
+            except (OSError, RuntimeError) as error:
+                raise self._refused("the end of the file", error) from error
+
+    @contextmanager
+    def _writing(self, what: str) -> Iterator[h5py.File]:
+        with self._lock:
+            if self._file is None:
+                raise SessionError(f"{self.path}: {what} cannot be written, the file is closed already")
+            try:
+                yield self._file
+            except (OSError, RuntimeError) as error:
+                raise self._refused(what, error) from error
+
+    def _refused(self, what: str, error: Exception) -> SessionError:
+        return SessionError(
+            f"{self.path}: {what} could not be written ({str(error).splitlines()[0]}); check the free "
+            f"disk space, then save the {self._frames} stored frames with: s2p3 dataset repair {self.path}"
+        )
+
+
+def _lay_out(
+    file: h5py.File, kind: str, camera: CameraInfo, rig_toml: str, dtype: np.dtype[np.unsignedinteger]
+) -> None:
+    """Everything a recording can hold is made before the first frame: a file that is read while it grows may
+    get no new datasets."""
+    file.attrs.update(
+        {
+            "format": FORMAT,
+            "schema": VERSION,
+            "session_id": uuid.uuid4().hex,
+            "kind": kind,
+            "created_utc": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "toolkit": f"s2p3 {metadata.version('s2p3')}",
+            "rig_toml": rig_toml,
+            "complete": False,
+        }
+    )
+    raw = declaration("camera/raw")
+    make_dataset(file, raw, raw.path, None, (0, camera.height, camera.width), dtype)
+    growing = [
+        "camera/crc32",
+        "camera/drops",
+        *(f"camera/{name}" for name in FRAME_COLUMNS),
+        *(f"robot/{name}" for name in ROBOT_COLUMNS),
+    ]
+    for declared in map(declaration, growing):
+        row = tuple(n for n in declared.shape[1:] if isinstance(n, int))
+        make_dataset(file, declared, declared.path, None, (0, *row), dtype_of(declared))
+    for path, size in (("robot/tcp_offset", 6), ("clocks/camera", 3), ("clocks/robot", 3)):
+        make_dataset(file, declaration(path), path, np.full(size, np.nan), (size,), np.float64)
+    for attribute in CAMERA_ATTRIBUTES:
+        file["camera"].attrs[attribute.name] = getattr(camera, attribute.name)
+    file.flush()
+
+
+def _put(dataset: h5py.Dataset, index: int, rows: ArrayLike) -> None:
+    rows = np.asarray(rows)
+    dataset.resize(index + len(rows), axis=0)
+    dataset[index:] = rows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from dataset.errors import DeviceError
 
@@ -12,20 +12,25 @@ _INSTALL = (
 )
 
 
-def load_aravis() -> Any:
-    """The `Aravis` introspection module.
+class AravisLibrary(NamedTuple):
+    """The introspected module, and what its calls raise."""
+
+    module: Any
+    error: type[Exception]
+
+
+def load_aravis() -> AravisLibrary:
+    """Loads Aravis 0.8.
 
     Raises DeviceError naming the packages to install when PyGObject or the typelib is missing.
     """
     try:
         import gi
     except ImportError as error:
-        raise DeviceError(
-            f"PyGObject is not installed, so no GigE Vision camera can be used; {_INSTALL}"
-        ) from error
+        raise DeviceError(f"PyGObject, which GigE Vision cameras need, is missing; {_INSTALL}") from error
     try:
         gi.require_version("Aravis", "0.8")
-        from gi.repository import Aravis
+        from gi.repository import Aravis, GLib
     except (ImportError, ValueError) as error:
-        raise DeviceError(f"the Aravis 0.8 typelib is not installed ({error}); {_INSTALL}") from error
-    return Aravis
+        raise DeviceError(f"the Aravis 0.8 typelib is missing ({error}); {_INSTALL}") from error
+    return AravisLibrary(Aravis, GLib.Error)

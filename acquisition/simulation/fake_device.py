@@ -79,7 +79,7 @@ class FakeDevice:
         Raises DeviceError when the address is not this machine's or its port is taken.
         """
         _check_port(address)
-        aravis = load_aravis()
+        aravis = load_aravis().module
         self._library = _load_library()
         self._gv = aravis.GvFakeCamera.new_full(address, serial, str(GENICAM_XML))
         if not self._gv.is_running():
@@ -139,7 +139,7 @@ class FakeDevice:
             # The size that Aravis could report is that of received data, none here.
             size = exposure.format.size(exposure.height, exposure.width)
             memory = (ctypes.c_uint8 * size).from_address(library.arv_buffer_get_data(buffer, None))
-            timestamp_ns = self._fill(exposure, np.frombuffer(memory, np.uint8))
+            timestamp_ns = self._fill(exposure, np.ctypeslib.as_array(memory))
             # The device stamped the buffer before it asked for the filling, with the host's clock.
             library.arv_buffer_set_timestamp(buffer, timestamp_ns)
         except BaseException:

@@ -1,0 +1,1 @@
+"""Camera drivers; import the one that is needed."""

@@ -3,7 +3,7 @@
 A table is a dataclass, a key is a field. Field types: `bool`, `int`, `float`, `str`, `Literal[...]`, fixed
 and variable-length tuples of these, another dataclass (a table), and any of them `| None` (absent: `None`).
 A dataclass refuses values out of range by raising `ToolkitError` in `__post_init__`; the reader adds file and
-table.
+table (once: a message may already begin with its table, as ``[motor]`` or ``motor:``).
 """
 
 from __future__ import annotations
@@ -94,7 +94,8 @@ def _dataclass(cls: Any, table: Mapping[str, Any], source: str, prefix: str) -> 
     try:
         return cls(**values)
     except ToolkitError as error:
-        raise ToolkitError(f"{where} {error}") from error
+        what = str(error).removeprefix(f"[{prefix}]").removeprefix(f"{prefix}:").strip()
+        raise ToolkitError(f"{where} {what}") from error
 
 
 def _value(value: Any, annotation: Any, source: str, key: str) -> Any:

@@ -1,0 +1,1 @@
+"""Drivers of real robot arms, one file each; vendor packages are imported where they are used."""

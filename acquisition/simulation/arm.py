@@ -1,0 +1,119 @@
+"""The simulated arm itself: joints, tool, what stops it, and the registers it shares with its clients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acquisition.simulation.kinematics import JOINT_LIMIT, link_transforms
+from acquisition.simulation.motion import Motion
+from dataset.transforms import SE3, matrix_to_rotvec
+
+Floats = NDArray[np.float64]
+
+REGISTERS = 48
+HOME = (3.14, -1.57, 1.57, -1.57, -1.57, 0.0)
+
+# RTDE's safety_status_bits, safety_mode and robot_mode.
+NORMAL_BITS, PROTECTIVE_BITS, EMERGENCY_BITS = 1 << 0, 1 << 2 | 1 << 10, 1 << 6 | 1 << 7 | 1 << 10
+NORMAL_MODE, PROTECTIVE_MODE, EMERGENCY_MODE = 1, 3, 7
+POWER_OFF, IDLE, RUNNING = 3, 5, 7
+
+_STILL = 1e-4  # rad/s
+
+
+@dataclass
+class Registers:
+    """The general-purpose registers of RTDE, through which a program and its client talk."""
+
+    input_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
+    input_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
+    output_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
+    output_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
+
+
+class Arm:
+    """Six joints on a table whose plane is z = 0, with the tool that the program has set."""
+
+    def __init__(self, q: Floats) -> None:
+        self.q = np.array(q, dtype=np.float64)
+        self.qd = np.zeros(6)
+        self.motion: Motion | None = None
+        self.safety_bits, self.safety_mode, self.robot_mode = NORMAL_BITS, NORMAL_MODE, RUNNING
+        self.last_stop = ""  # why the arm last stopped itself
+        self.set_tcp(np.zeros(6))
+        self._update()
+
+    def set_tcp(self, offset: Floats) -> None:
+        """The tool centre point in the flange frame, [x y z rx ry rz]."""
+        self.tcp_offset = np.array(offset, dtype=np.float64)
+        self.T_flange_tcp = SE3.from_pose6(self.tcp_offset)
+        self._T_flange_tcp = self.T_flange_tcp.as_matrix()
+        self._update()
+
+    @property
+    def stopped_by_safety(self) -> bool:
+        """Whether a protective or an emergency stop holds the arm."""
+        return self.safety_bits != NORMAL_BITS
+
+    @property
+    def steady(self) -> bool:
+        """Whether the arm is at rest."""
+        return bool(np.abs(self.qd).max() < _STILL)
+
+    def begin(self, motion: Motion | None) -> None:
+        """Starts a motion in place of the one under way; None ends it where it is."""
+        self.motion = motion
+        if motion is None:
+            self.qd = np.zeros(6)
+
+    def advance(self, dt: float) -> None:
+        """One controller period. A joint at its limit, or a link at the table, is a protective stop."""
+        if self.motion is None:
+            self.qd = np.zeros(6)
+            return
+        before = self.q
+        self.q, self.qd, ended = self.motion.advance(self.q, self.qd, dt)
+        self._update()
+        reason = self._violation()
+        if reason:
+            self.q = before
+            self._update()
+            self.protective_stop(reason)
+        elif ended:
+            self.begin(None)
+
+    def protective_stop(self, reason: str) -> None:
+        """Stops at once, as after a collision."""
+        self.safety_bits, self.safety_mode = PROTECTIVE_BITS, PROTECTIVE_MODE
+        self.last_stop = reason
+        self.begin(None)
+
+    def emergency_stop(self) -> None:
+        """Stops at once and cuts the power, as the red button does."""
+        self.safety_bits, self.safety_mode, self.robot_mode = EMERGENCY_BITS, EMERGENCY_MODE, POWER_OFF
+        self.begin(None)
+
+    def clear(self) -> None:
+        """Ends a stop: the operator has made the arm ready again."""
+        self.safety_bits, self.safety_mode, self.robot_mode = NORMAL_BITS, NORMAL_MODE, RUNNING
+
+    def tcp_speed(self) -> Floats:
+        """(6,) linear and angular velocity of the tool centre point in the base frame, m/s and rad/s."""
+        axes = self._links[:6, :3, 2]
+        levers = self.T_base_tcp[:3, 3] - self._links[:6, :3, 3]
+        return np.concatenate([self.qd @ np.cross(axes, levers), self.qd @ axes])
+
+    def _update(self) -> None:
+        self._links = link_transforms(self.q)
+        self.T_base_tcp: Floats = self._links[6] @ self._T_flange_tcp
+        self.tcp_pose = np.concatenate([self.T_base_tcp[:3, 3], matrix_to_rotvec(self.T_base_tcp[:3, :3])])
+
+    def _violation(self) -> str:
+        if np.abs(self.q).max() > JOINT_LIMIT:
+            return f"joint {int(np.abs(self.q).argmax()) + 1} is at its limit"
+        if min(self._links[2:, 2, 3].min(), self.T_base_tcp[2, 3]) < 0:
+            return "a link or the tool reached the table"
+        return ""

@@ -306,6 +306,6 @@ def _check_tool(sample: RobotSample, tcp_offset: Floats, host: str) -> None:
     if away > _PLAUSIBLE_M or turned > _PLAUSIBLE_DEG:
         raise DeviceError(
             f"the pose of the arm {host} is {1000 * away:.0f} mm and {turned:.1f} deg from that of a UR5e "
-            f"with the tool offset {np.round(tcp_offset, 4).tolist()}; check tcp_offset in the rig file against "
-            "the active tool at the pendant, and that the arm is a UR5e"
+            f"with the tool offset {np.round(tcp_offset, 4).tolist()}; check tcp_offset in the rig file "
+            "against the active tool at the pendant, and that the arm is a UR5e"
         )

@@ -1,0 +1,115 @@
+"""Relating a device's clock to the host's from nothing but arrival times.
+
+A sample can reach the host late, never early, so the truth lies along the lower envelope of host time against
+device time. The constant part of the latency cannot be told from an offset between the clocks; it is estimated
+from motion instead.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dataset.errors import ToolkitError
+from dataset.frames import ClockFit
+
+Floats = NDArray[np.float64]
+
+_WINDOW_S = 1.0
+_FEWEST_WINDOWS, _MOST_WINDOWS = 8, 400  # shorter windows for a short capture, longer ones for hours
+_SAMPLES_PER_WINDOW = 4  # and longer ones for single pictures, of which each can be late
+_FEWEST_SAMPLES = 5
+_CRYSTAL_PPM = 50.0  # our choice: how far a device's rate is expected from the host's before the data speak
+_LARGEST_RATE_ERROR = 0.01  # beyond it the times are in another unit
+_ROUNDS = 30
+_TUKEY = 4.0  # scatters from the line at which a window's earliest sample counts as late and is ignored
+
+
+def fit_clock(device_ns: ArrayLike, host_ns: ArrayLike) -> ClockFit:
+    """The line host = a + b * device along the lower envelope of the arrivals.
+
+    The earliest arrival of each second, then a robust line through those; the rate is drawn towards 1 with the
+    accuracy of a crystal, which only shows where the capture lasts a few seconds.
+
+    Args:
+        device_ns: (N,) times on the device's clock, nanoseconds, strictly increasing.
+        host_ns: (N,) when each was first seen, host monotonic nanoseconds; packets read together share one.
+
+    Returns:
+        The fit. Its sigma is that of the earliest arrivals about the line: it bounds the jitter, and cannot
+        see a latency that is always there.
+
+    Raises:
+        ToolkitError: fewer than 5 samples, lengths that differ, times that do not increase, or clocks whose
+            rates differ by more than 1 %.
+    """
+    device, host = np.asarray(device_ns, dtype=np.int64), np.asarray(host_ns, dtype=np.int64)
+    _check(device, host)
+    elapsed = (device - device[0]) * 1e-9
+    lateness = ((host - host[0]) - (device - device[0])).astype(np.float64)  # ns; small, so exact as a float
+    times, earliest = _window_minima(elapsed, lateness)
+    centre, slope, scatter = _robust_line(times, earliest)
+    if abs(slope) > _LARGEST_RATE_ERROR * 1e9:
+        raise ToolkitError(
+            f"the device's clock runs {1 + slope * 1e-9:.3f} times as fast as the host's; its times are not in "
+            "nanoseconds, or its clock was set during the recording: record again"
+        )
+    b = 1.0 + slope * 1e-9
+    # host = host[0] + (device - device[0]) + centre + slope * (elapsed - mean), gathered by powers of device.
+    middle = float(times.mean())
+    offset_ns = int(host[0]) - int(device[0])
+    a_ns = offset_ns + centre - slope * (middle + int(device[0]) * 1e-9)
+    return ClockFit(a_ns=float(a_ns), b=b, sigma_ns=scatter)
+
+
+def _check(device: NDArray[np.int64], host: NDArray[np.int64]) -> None:
+    if device.ndim != 1 or device.shape != host.shape:
+        raise ToolkitError(f"fit_clock: {device.shape} device and {host.shape} host times; give N of each")
+    if len(device) < _FEWEST_SAMPLES:
+        raise ToolkitError(
+            f"fit_clock: {len(device)} samples cannot relate two clocks; record at least {_FEWEST_SAMPLES}"
+        )
+    for name, times, allowed in (("device", device, 1), ("host", host, 0)):
+        step = np.diff(times)
+        if step.min() < allowed:
+            index = int(np.argmax(step < allowed)) + 1
+            raise ToolkitError(
+                f"fit_clock: the {name} time goes from {times[index - 1]} to {times[index]} ns at sample {index}; "
+                "the device restarted or its clock was set: use only the samples before or after"
+            )
+
+
+def _window_minima(elapsed_s: Floats, lateness_ns: Floats) -> tuple[Floats, Floats]:
+    """The least late sample of every window: its time and its lateness."""
+    span = float(elapsed_s[-1])
+    wanted = min(span / _WINDOW_S, len(elapsed_s) / _SAMPLES_PER_WINDOW)
+    count = int(np.clip(wanted, _FEWEST_WINDOWS, _MOST_WINDOWS))
+    window = np.minimum((elapsed_s * (count / span)).astype(np.int64), count - 1)
+    order = np.lexsort((lateness_ns, window))
+    first = np.flatnonzero(np.diff(window[order], prepend=-1))
+    chosen = order[first]
+    return elapsed_s[chosen], lateness_ns[chosen]
+
+
+def _robust_line(times_s: Floats, values_ns: Floats) -> tuple[float, float, float]:
+    """The value at the mean time, the slope per second, and the scatter, by reweighted least squares."""
+    centred = times_s - times_s.mean()
+    value, slope = float(np.median(values_ns)), 0.0
+    if len(times_s) > 2:
+        i, j = np.triu_indices(len(times_s), k=1)
+        slope = float(np.median((values_ns[j] - values_ns[i]) / (times_s[j] - times_s[i])))  # Theil-Sen
+        value = float(np.median(values_ns - slope * centred))
+    for _ in range(_ROUNDS):
+        residual = values_ns - value - slope * centred
+        scatter = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), 1.0)
+        weight = np.clip(1 - (residual / (_TUKEY * scatter)) ** 2, 0, None) ** 2
+        prior = (scatter / (_CRYSTAL_PPM * 1e3)) ** 2  # the rate is 0 +- 50 ppm, that is 50 000 ns per second
+        normal = np.array(
+            [
+                [weight.sum(), (weight * centred).sum()],
+                [(weight * centred).sum(), (weight * centred**2).sum() + prior],
+            ]
+        )
+        right = np.array([(weight * values_ns).sum(), (weight * centred * values_ns).sum()])
+        value, slope = (float(x) for x in np.linalg.solve(normal, right))
+    return value, slope, scatter

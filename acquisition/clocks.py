@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 _WINDOW_S = 1.0
 _FEWEST_WINDOWS, _MOST_WINDOWS = 8, 400  # shorter windows for a short capture, longer ones for hours
 _SAMPLES_PER_WINDOW = 4  # and longer ones for single pictures, of which each can be late
-_FEWEST_SAMPLES = 5
+FEWEST_SAMPLES = 5
 _CRYSTAL_PPM = 50.0  # our choice: how far a device's rate is expected from the host's before the data speak
 _LARGEST_RATE_ERROR = 0.01  # beyond it the times are in another unit
 _ROUNDS = 30
@@ -65,9 +65,9 @@ def fit_clock(device_ns: ArrayLike, host_ns: ArrayLike) -> ClockFit:
 def _check(device: NDArray[np.int64], host: NDArray[np.int64]) -> None:
     if device.ndim != 1 or device.shape != host.shape:
         raise ToolkitError(f"fit_clock: {device.shape} device and {host.shape} host times; give N of each")
-    if len(device) < _FEWEST_SAMPLES:
+    if len(device) < FEWEST_SAMPLES:
         raise ToolkitError(
-            f"fit_clock: {len(device)} samples cannot relate two clocks; record at least {_FEWEST_SAMPLES}"
+            f"fit_clock: {len(device)} samples cannot relate two clocks; record at least {FEWEST_SAMPLES}"
         )
     for name, times, allowed in (("device", device, 1), ("host", host, 0)):
         step = np.diff(times)

@@ -1,0 +1,110 @@
+"""Does a set of arm poses determine the hand-eye transform? Asked before anything is solved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataset.errors import CalibrationError
+from dataset.transforms import SE3
+
+MIN_POSES = 5
+MIN_SPREAD_DEG = 3.0
+"""Least rms rotation about the second principal axis (our choice): below it, an arm's noise passes for
+motion."""
+
+_SAME_M = 1e-3
+_SAME_RAD = np.radians(0.3)
+
+
+@dataclass(frozen=True, eq=False)
+class RotationSpread:
+    """How the tool's orientation varied.
+
+    Attributes:
+        axes: (3, 3) rows are principal axes of rotation in the tool's frame, largest spread first.
+        rms_deg: (3,) root mean square rotation about each, degrees.
+    """
+
+    axes: NDArray[np.float64]
+    rms_deg: NDArray[np.float64]
+
+
+def rotation_spread(T_base_tcp: SE3) -> RotationSpread:
+    """Principal axes of the rotations of N poses about their mean orientation, in the tool's frame."""
+    u, _, vt = np.linalg.svd(T_base_tcp.rotation.sum(axis=0))
+    mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    about_mean = SE3(mean.T @ T_base_tcp.rotation, np.zeros_like(T_base_tcp.translation)).as_rotvec()
+    about_mean = about_mean - about_mean.mean(axis=0)
+    _, singular, axes = np.linalg.svd(about_mean, full_matrices=True)
+    rms = np.zeros(3)
+    rms[: len(singular)] = np.degrees(singular / np.sqrt(len(about_mean)))
+    return RotationSpread(axes, rms)
+
+
+def require_observable(T_base_tcp: SE3) -> RotationSpread:
+    """The spread of N tool poses, if it determines a hand-eye transform (two rotation axes that are not
+    parallel).
+
+    Raises:
+        CalibrationError: NaN poses, too few, the same pose repeated, no rotation, or rotation about one axis
+            only (the message names the axis along which the camera's position stays unknown).
+    """
+    bad = np.flatnonzero(~T_base_tcp.finite)
+    if len(bad):
+        raise CalibrationError(
+            f"hand-eye: the arm's pose is NaN or infinite in view {', '.join(map(str, bad[:8]))};"
+            " drop these views or check the recorded trace"
+        )
+    if len(T_base_tcp) < MIN_POSES:
+        raise CalibrationError(
+            f"hand-eye: {len(T_base_tcp)} views show the board; at least {MIN_POSES} are needed, 20-25 are"
+            " good"
+        )
+    distinct = _distinct_poses(T_base_tcp)
+    if distinct < MIN_POSES:
+        raise CalibrationError(
+            f"hand-eye: only {distinct} of {len(T_base_tcp)} arm poses differ by more than 1 mm or 0.3"
+            " degrees;"
+            " the same pose repeated adds nothing: record different poses"
+        )
+    spread = rotation_spread(T_base_tcp)
+    if spread.rms_deg[0] < MIN_SPREAD_DEG:
+        raise CalibrationError(
+            f"hand-eye: the tool hardly rotated ({spread.rms_deg[0]:.2f} degrees rms), so the camera's"
+            " position on it is"
+            " not observable; rotate the tool by 15-30 degrees about at least two axes between views"
+        )
+    if spread.rms_deg[1] < MIN_SPREAD_DEG:
+        first, second = spread.axes[0], spread.axes[1]
+        raise CalibrationError(
+            f"hand-eye: the tool rotated about one axis only ({_name_axis(first)}, {spread.rms_deg[0]:.1f}"
+            " degrees rms;"
+            f" {spread.rms_deg[1]:.2f} about {_name_axis(second)}), so the camera's position along that"
+            " axis is not"
+            f" observable; add views tilted by 15-30 degrees about {_name_axis(second)} of the tool"
+        )
+    return spread
+
+
+def _distinct_poses(poses: SE3) -> int:
+    kept: list[SE3] = []
+    for pose in poses:
+        moved = [pose.inverse() @ other for other in kept]
+        if all(
+            np.linalg.norm(m.translation) > _SAME_M or np.linalg.norm(m.as_rotvec()) > _SAME_RAD
+            for m in moved
+        ):
+            kept.append(pose)
+    return len(kept)
+
+
+def _name_axis(axis: NDArray[np.float64]) -> str:
+    """'x', 'y' or 'z' when it is nearly one of them, the vector otherwise."""
+    largest = int(np.argmax(np.abs(axis)))
+    if abs(axis[largest]) > np.cos(np.radians(10.0)):
+        return "xyz"[largest]
+    axis = axis * np.sign(axis[largest])
+    return f"[{axis[0]:.2f} {axis[1]:.2f} {axis[2]:.2f}]"

@@ -1,0 +1,281 @@
+"""From recorded sessions to calibration results, and from a calibration back to camera poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.board import BoardSpec
+from calibration.closed_forms import mean_pose
+from calibration.detection import Detection, detect_in_mosaic, explain_missing_board, intensity_image
+from calibration.hand_eye import HandEyeResult, calibrate_hand_eye
+from calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
+from calibration.object_pose import ObjectPoseResult, register_points
+from calibration.result import Calibration, HandEyeRecord, IntrinsicsRecord
+from calibration.time_offset import TimeOffsetResult, estimate_time_offset
+from dataset.errors import CalibrationError
+from dataset.session import Session
+from dataset.transforms import SE3, interpolate_poses
+
+Floats = NDArray[np.float64]
+Detections = list[tuple[int, Detection]]
+Progress = Callable[[int, int], None]
+"""Called with (frames done, frames in all)."""
+
+_REST_WINDOW_S = 0.1
+_REST_SEARCH_S = 0.5
+_REST_M = 3e-4
+_REST_RAD = np.radians(0.05)
+_SLOPE_SPAN_S = 0.02
+
+
+def detect_session(session: Session, spec: BoardSpec, on_progress: Progress | None = None) -> Detections:
+    """The board in every frame that shows it: (frame index, corners in mosaic pixels).
+
+    Raises:
+        CalibrationError: no frame shows the board; the message says what the middle frame shows instead.
+    """
+    found: Detections = []
+    for index in range(len(session)):
+        detection = detect_in_mosaic(session.raw(index), session.camera.mosaic, spec)
+        if detection is not None:
+            found.append((index, detection))
+        if on_progress is not None:
+            on_progress(index + 1, len(session))
+    if not found:
+        raise CalibrationError(f"{session.path}: no frame shows the board; {_why_no_board(session, spec)}")
+    return found
+
+
+def intrinsics_from_session(
+    session: Session, spec: BoardSpec, detections: Detections | None = None
+) -> IntrinsicsResult:
+    """Intrinsics at the mosaic's grid from a session that shows the board.
+
+    Args:
+        session: kind "intrinsics" or "hand_eye".
+        spec: the board.
+        detections: of `detect_session`, if it ran already.
+
+    Raises:
+        CalibrationError: as `detect_session` and `calibrate_intrinsics`.
+    """
+    detections = detect_session(session, spec) if detections is None else detections
+    size = session.camera.height, session.camera.width
+    return calibrate_intrinsics([d for _, d in detections], spec, size)
+
+
+def hand_eye_from_session(
+    session: Session,
+    spec: BoardSpec,
+    intrinsics: IntrinsicsRecord,
+    detections: Detections | None = None,
+) -> HandEyeResult:
+    """T_tcp_cam and T_base_board from stills of a fixed board; views in which the arm was not at rest are
+    left out.
+
+    Raises:
+        CalibrationError: as `detect_session` and `calibrate_hand_eye`, or no robot trace.
+    """
+    detections = detect_session(session, spec) if detections is None else detections
+    times, trace = arm_trace(session)
+    views: list[Detection] = []
+    poses: list[SE3] = []
+    for index, detection in detections:
+        pose = rest_pose(times, trace, int(session.mid_exposure_host_ns[index]))
+        if pose is not None:
+            views.append(detection)
+            poses.append(pose)
+    if detections and not poses:
+        raise CalibrationError(
+            f"{session.path}: the arm was never at rest when a picture was taken; record stills with"
+            " `s2p3 capture hand-eye`, which waits for the arm to settle"
+        )
+    return calibrate_hand_eye(SE3.stack(poses), views, spec, intrinsics.intrinsics, intrinsics.covariance)
+
+
+def time_offset_from_session(
+    session: Session,
+    spec: BoardSpec,
+    intrinsics: IntrinsicsRecord,
+    hand_eye: HandEyeRecord,
+    detections: Detections | None = None,
+) -> TimeOffsetResult:
+    """The camera-to-arm delay from pictures of the same board taken in motion.
+
+    Raises:
+        CalibrationError: as `detect_session` and `estimate_time_offset`, or no robot trace.
+    """
+    detections = detect_session(session, spec) if detections is None else detections
+    times, trace = arm_trace(session)
+    return estimate_time_offset(
+        session.mid_exposure_host_ns[[index for index, _ in detections]],
+        times,
+        trace,
+        [d for _, d in detections],
+        spec,
+        intrinsics.intrinsics,
+        hand_eye.T_tcp_cam,
+        hand_eye.T_base_board,
+    )
+
+
+def object_from_touches(
+    touches: Session | str | Path,
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    tip_in_tcp: ArrayLike = (0.0, 0.0, 0.0),
+    init: SE3 | None = None,
+    symmetry_axis: ArrayLike | None = None,
+) -> ObjectPoseResult:
+    """The pose of an object in the base frame from touched points.
+
+    Args:
+        touches: a session of kind "tool_tip" with one frame a touch (the arm at rest, the tip on the
+            surface), or a text file of points: x y z a line, metres in the base frame, '#' starts a comment.
+        vertices, faces: (V, 3) metres, (F, 3): the object.
+        tip_in_tcp: (3,) the tip in the tool's frame, metres; only used with a session.
+        init, symmetry_axis: as in `register_points`.
+
+    Raises:
+        CalibrationError: as `register_points`, or no readable points.
+    """
+    if isinstance(touches, Session):
+        points = touched_points(touches, tip_in_tcp)
+    else:
+        points = read_points(touches)
+    return register_points(points, vertices, faces, init, symmetry_axis)
+
+
+def touched_points(session: Session, tip_in_tcp: ArrayLike) -> Floats:
+    """(n, 3) where the tool's tip was, in the base frame, in each frame of a session; the arm at rest.
+
+    Raises:
+        CalibrationError: no robot trace, or the arm moved at a touch.
+    """
+    times, trace = arm_trace(session)
+    points: list[Floats] = []
+    for index in range(len(session)):
+        pose = rest_pose(times, trace, int(session.mid_exposure_host_ns[index]))
+        if pose is None:
+            raise CalibrationError(
+                f"{session.path}: the arm was moving at touch {index}; hold the tip still for half a second"
+                " a touch"
+            )
+        points.append(pose.apply(np.asarray(tip_in_tcp, np.float64)))
+    return np.array(points).reshape(-1, 3)
+
+
+def read_points(path: str | Path) -> Floats:
+    """(n, 3) points of a text file: x y z a line (spaces or commas), metres, '#' starts a comment.
+
+    Raises:
+        CalibrationError: missing, not numbers, or not three a line.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8").replace(",", " ")
+        rows = [line.split("#")[0].split() for line in text.splitlines()]
+        points = np.array([[float(value) for value in row] for row in rows if row])
+    except (OSError, ValueError) as error:
+        raise CalibrationError(
+            f"{path}: cannot be read as points ({str(error).splitlines()[0]}); give x y z a line, in metres"
+        ) from error
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise CalibrationError(f"{path}: not three numbers a line; give x y z in metres, base frame")
+    return points
+
+
+def arm_trace(session: Session) -> tuple[NDArray[np.int64], SE3]:
+    """Times (M,) i64 ns on the host clock, increasing, and poses T_base_tcp of the arm's samples.
+
+    The controller's own clock, mapped by its fit, is used where there is one: it does not jitter.
+
+    Raises:
+        CalibrationError: the session has no robot trace.
+    """
+    if session.robot is None or len(session.robot) < 2:
+        raise CalibrationError(f"{session.path}: no robot trace; record it with the arm connected")
+    fit = session.clocks.robot
+    if fit is None:
+        times = session.robot.host_time_ns
+    else:
+        times = fit.to_host(np.rint(session.robot.robot_time_s * 1e9).astype(np.int64))
+    growing = np.flatnonzero(np.diff(np.maximum.accumulate(times), prepend=times[0] - 1) > 0)
+    return times[growing], session.robot.poses[growing]
+
+
+def rest_pose(times_ns: NDArray[np.int64], trace: SE3, at_ns: int) -> SE3 | None:
+    """The arm's pose when it last stood still for 0.1 s, at or up to 0.5 s before ``at_ns``; None if it did
+    not.
+
+    A picture's time carries an unknown constant delay until that is calibrated, so a still is not looked up
+    at one instant but in the rest before it.
+    """
+    for back_s in np.arange(0.0, _REST_SEARCH_S, 0.5 * _REST_WINDOW_S):
+        end = at_ns - int(1e9 * back_s)
+        first, last = np.searchsorted(times_ns, (end - int(1e9 * _REST_WINDOW_S), end))
+        if last - first < 3:
+            continue
+        window = trace[first:last]
+        mean = mean_pose(window)
+        apart = mean.inverse() @ window
+        still = np.linalg.norm(apart.translation, axis=1).max() < _REST_M
+        if still and np.linalg.norm(apart.as_rotvec(), axis=1).max() < _REST_RAD:
+            return mean
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPoses:
+    """T_base_cam (N) at mid exposure, NaN where the arm's trace does not reach; standard deviations (N,)."""
+
+    T_base_cam: SE3
+    sigma_m: Floats
+    sigma_rad: Floats
+
+
+def camera_poses(session: Session, calibration: Calibration) -> CameraPoses:
+    """Where the camera was in every frame: the arm's trace at mid exposure plus the time offset, times
+    T_tcp_cam.
+
+    The uncertainty adds those of the hand-eye transform, of the arm, and of the time offset times the speed.
+
+    Raises:
+        CalibrationError: the hand-eye transform is missing, or there is no robot trace.
+    """
+    calibration.require("hand_eye")
+    hand_eye = calibration.hand_eye
+    assert hand_eye is not None
+    offset = calibration.time_offset
+    offset_s, offset_sigma_s = (0.0, 0.0) if offset is None else (offset.offset_s, offset.sigma_s)
+    times_ns, trace = arm_trace(session)
+    origin = int(times_ns[0])
+    times = (times_ns - origin) * 1e-9
+    at = (session.mid_exposure_host_ns - origin) * 1e-9 + offset_s
+    known = (at >= times[0]) & (at <= times[-1])
+    T_base_cam = interpolate_poses(times, trace, np.clip(at, times[0], times[-1])) @ hand_eye.T_tcp_cam
+    before = interpolate_poses(times, trace, np.clip(at - _SLOPE_SPAN_S, times[0], times[-1]))
+    after = interpolate_poses(times, trace, np.clip(at + _SLOPE_SPAN_S, times[0], times[-1]))
+    moved = (before @ hand_eye.T_tcp_cam).inverse() @ (after @ hand_eye.T_tcp_cam)
+    speed = np.linalg.norm(moved.translation, axis=1) / (2 * _SLOPE_SPAN_S)
+    turning = np.linalg.norm(moved.as_rotvec(), axis=1) / (2 * _SLOPE_SPAN_S)
+    variance_m = np.trace(hand_eye.covariance[:3, :3]) + 3 * hand_eye.arm_sigma_m**2
+    variance_rad = np.trace(hand_eye.covariance[3:6, 3:6]) + 3 * hand_eye.arm_sigma_rad**2
+    rotation, translation = T_base_cam.rotation.copy(), T_base_cam.translation.copy()
+    rotation[~known], translation[~known] = np.nan, np.nan
+    return CameraPoses(
+        SE3(rotation, translation),
+        np.sqrt(variance_m + (speed * offset_sigma_s) ** 2),
+        np.sqrt(variance_rad + (turning * offset_sigma_s) ** 2),
+    )
+
+
+def _why_no_board(session: Session, spec: BoardSpec) -> str:
+    if len(session) == 0:
+        return "the session holds no frame"
+    middle = len(session) // 2
+    return explain_missing_board(intensity_image(session.raw(middle), session.camera.mosaic), spec)

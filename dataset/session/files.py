@@ -7,8 +7,10 @@ every moment, so that a process killed at any instant leaves what it had flushed
 from __future__ import annotations
 
 import errno
+import fcntl
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,24 +49,33 @@ def open_for_reading(path: Path) -> tuple[h5py.File, bool]:
     Raises:
         SessionError: missing, not HDF5, damaged, not a session, or of a newer major version.
     """
-    try:
-        file, unfinished = h5py.File(path, "r"), False
-    except OSError as error:
-        if "already open for write" not in str(error):
-            raise _explained(path, error) from error
-        try:
-            file, unfinished = h5py.File(path, "r", libver=LIBVER, swmr=True), True
-        except OSError as swmr_error:
-            raise SessionError(
-                f"{path} is being changed by another program, or one was killed while changing it; "
-                f"close that program, or run: s2p3 dataset repair {path}"
-            ) from swmr_error
+    file, unfinished = open_hdf5(path)
     try:
         check_format(path, file)
     except SessionError:
         file.close()
         raise
     return file, unfinished
+
+
+def open_hdf5(path: Path) -> tuple[h5py.File, bool]:
+    """As `open_for_reading`, of any HDF5 file.
+
+    Raises:
+        SessionError: missing, not HDF5, or damaged.
+    """
+    try:
+        return h5py.File(path, "r"), False
+    except OSError as error:
+        if "already open for write" not in str(error):
+            raise _explained(path, error) from error
+        try:
+            return h5py.File(path, "r", libver=LIBVER, swmr=True), True
+        except OSError as swmr_error:
+            raise SessionError(
+                f"{path} is being changed by another program, or one was killed while changing it; "
+                f"close that program, or run: s2p3 dataset repair {path}"
+            ) from swmr_error
 
 
 @contextmanager
@@ -74,6 +85,8 @@ def open_for_editing(path: Path) -> Iterator[h5py.File]:
     Raises:
         SessionError: as `open_for_reading`, or the recording is incomplete.
     """
+    if path.is_file() and in_use(path):
+        raise SessionError(f"{path} is in use by another program; wait for it or close it")
     file, unfinished = open_for_reading(path)
     complete = not unfinished and bool(file.attrs.get("complete", False))
     file.close()
@@ -85,6 +98,32 @@ def open_for_editing(path: Path) -> Iterator[h5py.File]:
         raise _explained(path, error) from error
     with file:
         yield file
+
+
+def hold(path: Path) -> int:
+    """Marks a file as in use, for `in_use` in any process, until the returned descriptor is closed.
+
+    HDF5 itself gives its lock up once a file may be read while it grows. Where the file system has no
+    locks, files simply count as not in use.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    with suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    return descriptor
+
+
+def in_use(path: Path) -> bool:
+    """Whether any program has the session open: recording, changing or reading it."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return False
 
 
 def check_format(path: Path, file: h5py.File) -> None:

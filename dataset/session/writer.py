@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import uuid
 from collections.abc import Iterator
@@ -31,7 +32,7 @@ from dataset.schema import (
     declaration,
 )
 from dataset.session.edit import store_intrinsics, store_object
-from dataset.session.files import LIBVER, create, dtype_of, make_dataset
+from dataset.session.files import LIBVER, create, dtype_of, hold, make_dataset
 from dataset.session.records import ObjectRecord
 
 
@@ -81,6 +82,7 @@ class SessionWriter:
         if intrinsics is not None:
             store_intrinsics(self._file, intrinsics)
         self._file.swmr_mode = True
+        self._held = hold(self.path)
 
     def __enter__(self) -> SessionWriter:
         return self
@@ -174,10 +176,13 @@ class SessionWriter:
         with self._writing(f"object {record.name}") as file:
             # a file being read while it grows may get no new groups: leave that mode for a moment
             file.close()
-            with h5py.File(self.path, "r+", libver=LIBVER) as editable:
-                store_object(editable, record)
+            os.close(self._held)
             self._file = h5py.File(self.path, "r+", libver=LIBVER)
-            self._file.swmr_mode = True
+            try:
+                store_object(self._file, record)
+            finally:
+                self._file.swmr_mode = True
+                self._held = hold(self.path)
 
     def finish(self) -> None:
         """Marks the file complete and closes it; nothing may be added afterwards."""
@@ -196,6 +201,7 @@ class SessionWriter:
             file, self._file = self._file, None
             if file is None:
                 return
+            os.close(self._held)
             try:
                 file.close()
             except (OSError, RuntimeError) as error:

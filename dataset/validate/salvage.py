@@ -1,0 +1,126 @@
+"""Copying what can be read of a session into a new file, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from dataset.compression import compress
+from dataset.schema import DATASETS, DROP_DTYPE, ROBOT_COLUMNS, Dataset, declaration
+from dataset.session.files import make_dataset
+from dataset.validate.problems import READ_ERRORS
+
+Indices = NDArray[np.int64]
+
+
+def copy_content(source: h5py.File, target: h5py.File, keep: Indices, damaged: Indices) -> tuple[str, ...]:
+    """Copies a session with only some of its frames.
+
+    Args:
+        source: open for reading, perhaps damaged.
+        target: open for writing, empty.
+        keep: frames to copy; everything that has one row a frame is cut to these, splits are renumbered.
+        damaged: frames to enter in the ledger instead.
+
+    Returns:
+        Paths that could not be read and are left out.
+    """
+    lost: list[str] = []
+    target.attrs.update(dict(source.attrs))
+    samples = _readable_samples(source)
+    for path, node in _walk(source, "", lost):
+        if isinstance(node, h5py.Group):
+            target.require_group(path).attrs.update(dict(node.attrs))
+            continue
+        declared = _declared(path)
+        try:
+            if path == "camera/drops":
+                _copy_drops(source, target, damaged)
+            elif declared is not None and declared.compressed:
+                _copy_images(node, target, declared, path, keep)
+            elif declared is not None:
+                data = _rows(node, declared, keep, samples)
+                make_dataset(target, declared, path, data, data.shape, node.dtype)
+            else:
+                source.copy(node, target, name=path)
+        except READ_ERRORS:
+            lost.append(path)
+            target.pop(path, None)
+    _restore_required(target)
+    return tuple(lost)
+
+
+def _walk(group: h5py.Group, prefix: str, lost: list[str]) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]:
+    try:
+        names = list(group)
+    except READ_ERRORS:
+        lost.append(prefix.rstrip("/"))
+        return
+    for name in names:
+        path = prefix + name
+        try:
+            node = group[name]
+        except READ_ERRORS:
+            lost.append(path)
+            continue
+        yield path, node
+        if isinstance(node, h5py.Group):
+            yield from _walk(node, path + "/", lost)
+
+
+def _declared(path: str) -> Dataset | None:
+    parts = path.split("/")
+    for declared in DATASETS:
+        pattern = declared.path.split("/")
+        if len(pattern) == len(parts) and all(p in ("*", q) for p, q in zip(pattern, parts, strict=True)):
+            return declared
+    return None
+
+
+def _rows(node: h5py.Dataset, declared: Dataset, keep: Indices, samples: int) -> NDArray[np.generic]:
+    first = declared.shape[0] if declared.shape else None
+    if first == "N":
+        rows: NDArray[np.generic] = node[: int(keep[-1]) + 1 if len(keep) else 0][keep]
+        return rows
+    if first == "M":
+        return np.asarray(node[:samples])
+    if declared.path == "splits/*":
+        chosen = node[:]
+        return np.searchsorted(keep, chosen[np.isin(chosen, keep)])
+    return np.asarray(node[()], dtype=node.dtype)
+
+
+def _copy_images(node: h5py.Dataset, target: h5py.File, declared: Dataset, path: str, keep: Indices) -> None:
+    stored = make_dataset(target, declared, path, None, (len(keep), *node.shape[1:]), node.dtype)
+    for row, index in enumerate(keep):
+        stored.id.write_direct_chunk((row, 0, 0), compress(node[int(index)]).data)
+
+
+def _copy_drops(source: h5py.File, target: h5py.File, damaged: Indices) -> None:
+    declared = declaration("camera/drops")
+    ids, times = source["camera/frame_id"], source["camera/host_time_ns"]
+    rows = [(int(ids[int(i)]), b"damaged in the file", int(times[int(i)])) for i in damaged]
+    ledger = np.concatenate([source["camera/drops"][:], np.array(rows, dtype=DROP_DTYPE)])
+    make_dataset(target, declared, declared.path, ledger, ledger.shape, ledger.dtype)
+
+
+def _readable_samples(source: h5py.File) -> int:
+    """Rows that every column of the robot's trace has; none when one of them cannot be read."""
+    try:
+        return min(len(source[f"robot/{name}"][:]) for name in ROBOT_COLUMNS)
+    except READ_ERRORS:
+        return 0
+
+
+def _restore_required(target: h5py.File) -> None:
+    """Empty stand-ins for what every session has and this one lost."""
+    for declared in DATASETS:
+        if not declared.required or "*" in declared.path or declared.path in target:
+            continue
+        kind = np.dtype(DROP_DTYPE) if declared.dtypes[0] == "drop" else np.dtype(declared.dtypes[0])
+        shape = tuple(n if isinstance(n, int) else 0 for n in declared.shape)
+        fill = np.full(shape, np.nan if kind.kind == "f" else 0, dtype=kind) if 0 not in shape else None
+        make_dataset(target, declared, declared.path, fill, shape, kind)

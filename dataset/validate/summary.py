@@ -1,0 +1,91 @@
+"""What a session holds, at a glance; costs the same however long the session is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dataset.frames import CameraInfo
+from dataset.session.files import attribute, open_for_reading
+from dataset.session.reader import Session
+
+
+@dataclass(frozen=True)
+class SessionInfo:
+    """A summary.
+
+    Attributes:
+        path, kind, schema, session_id, created_utc, toolkit: as stored.
+        complete: whether the recording ended as intended.
+        advice: what to do about an incomplete file; empty otherwise.
+        repaired: when and what a repair restored; empty otherwise.
+        size_bytes: of the file.
+        camera: its description.
+        frames, drops: frames stored, and known to be missing.
+        duration_s: from the first to the last frame, camera clock, seconds.
+        robot_samples: of the arm's trace.
+        clocks: whose clock was fitted to the host's.
+        calibrated, posed: whether a calibration and camera poses are stored.
+        objects: names; annotated: those with poses.
+        splits: number of frames by name.
+    """
+
+    path: str
+    kind: str
+    schema: str
+    session_id: str
+    created_utc: str
+    toolkit: str
+    complete: bool
+    advice: str
+    repaired: str
+    size_bytes: int
+    camera: CameraInfo
+    frames: int
+    drops: int
+    duration_s: float
+    robot_samples: int
+    clocks: tuple[str, ...]
+    calibrated: bool
+    posed: bool
+    objects: tuple[str, ...]
+    annotated: tuple[str, ...]
+    splits: dict[str, int]
+
+
+def info(path: str | Path) -> SessionInfo:
+    """Summarises a session; an incomplete one too.
+
+    Raises:
+        SessionError: as `Session.open`.
+    """
+    path = Path(path)
+    with Session.open(path) as session:
+        file, _ = open_for_reading(path)
+        with file:
+            frames = len(session)
+            times = file["camera/camera_time_ns"]
+            fits = session.clocks
+            return SessionInfo(
+                path=str(path),
+                kind=session.kind,
+                schema=str(attribute(file, "schema")),
+                session_id=session.session_id,
+                created_utc=str(attribute(file, "created_utc")),
+                toolkit=str(attribute(file, "toolkit")),
+                complete=session.complete,
+                advice="" if session.complete else f"incomplete: run s2p3 dataset repair {path}",
+                repaired=str(attribute(file, "repaired") or ""),
+                size_bytes=path.stat().st_size,
+                camera=session.camera,
+                frames=frames,
+                drops=len(file["camera/drops"]),
+                duration_s=(int(times[frames - 1]) - int(times[0])) * 1e-9 if frames else 0.0,
+                robot_samples=len(file["robot/host_time_ns"]),
+                clocks=tuple(name for name in ("camera", "robot") if getattr(fits, name) is not None),
+                calibrated="calibration/K" in file,
+                posed="poses/T_base_cam" in file,
+                objects=session.objects,
+                annotated=tuple(file.get("poses/objects", ())),
+                splits={name: len(split) for name, split in file.get("splits", {}).items()},
+            )

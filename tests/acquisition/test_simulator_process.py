@@ -79,7 +79,7 @@ def test_refused_command_says_why_and_the_peer_goes_on(module: Callable[[str], s
 
 def test_late_answer_is_not_taken_for_the_next_one(module: Callable[[str], str]) -> None:
     with SimulatorProcess(module(ECHO)) as peer:
-        with pytest.raises(DeviceError, match="more than 0.1 s to answer 'think'"):
+        with pytest.raises(DeviceError, match=r"more than 0\.1 s to answer 'think'"):
             peer.command("think", timeout_s=0.1)
         time.sleep(1.2)
         assert peer.command("next") == "NEXT"

@@ -1,0 +1,168 @@
+"""Cameras that are not there, vanish, drift, or are asked by clients that are not ours."""
+
+import shutil
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from acquisition.camera import CameraConfig
+from acquisition.cameras.aravis import AravisCamera
+from acquisition.simulation.camera import SimulatedCamera
+from dataset.errors import DeviceError
+
+pytestmark = pytest.mark.devices
+
+SMALL = {"width": 256, "height": 192, "frame_rate": 50, "latency_s": 0.002}
+
+
+@pytest.mark.parametrize(
+    ("address", "match"),
+    [
+        ("127.0.0.1", "answers, but no camera listens there"),
+        ("nowhere.invalid", "neither an IPv4 address nor a known host name"),
+    ],
+)
+def test_no_camera_at_the_address(address: str, match: str) -> None:
+    started = time.monotonic()
+    with pytest.raises(DeviceError, match=match):
+        AravisCamera(CameraConfig(address))
+    assert time.monotonic() - started < 5
+
+
+def test_silence_at_the_address() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(("127.0.0.1", 3956))
+        started = time.monotonic()
+        with pytest.raises(DeviceError, match=r"no camera answers at 127\.0\.0\.1 .*cable.*subnet.*firewall"):
+            AravisCamera(CameraConfig("127.0.0.1"))
+        assert time.monotonic() - started < 5
+
+
+def test_missing_aravis_names_the_packages() -> None:
+    script = (
+        "import sys; sys.modules['gi'] = None\n"  # what Python does when a package is not there
+        "from acquisition.camera import CameraConfig\n"
+        "from acquisition.cameras.aravis import AravisCamera\n"
+        "AravisCamera(CameraConfig('127.0.0.1'))"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert "apt-get install gir1.2-aravis-0.8" in result.stderr.splitlines()[-1]
+
+
+def read_what_is_left(camera: AravisCamera) -> None:
+    """Reads on until the frames that arrived before a fault are used up."""
+    for _ in range(100):
+        camera.read()
+
+
+def test_a_camera_that_loses_power_and_comes_back() -> None:
+    with SimulatedCamera(**SMALL) as simulated:
+        with AravisCamera(CameraConfig("127.0.0.1", timeout_s=0.5)) as camera:
+            camera.start()
+            camera.read()
+            simulated.kill()
+            simulated.start()
+            with pytest.raises(DeviceError, match=r"was restarted.*open it again"):
+                read_what_is_left(camera)
+        with AravisCamera(CameraConfig("127.0.0.1")) as camera:
+            camera.start()
+            assert camera.read().pixels.shape == (192, 256)
+
+
+def test_a_source_that_fails_takes_the_camera_down_and_says_why(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path_factory.mktemp("sources")
+    (folder / "failing_source.py").write_text(
+        "import numpy as np\n"
+        "class Failing:\n"
+        "    calls = 0\n"
+        "    def frame(self, pixel_format, height, width, exposure_us, gain_db, time_ns):\n"
+        "        self.calls += 1\n"
+        "        if self.calls > 3:\n"
+        "            raise RuntimeError('the lamp broke')\n"
+        "        return np.full((height, width), self.calls, np.uint8)\n"
+        "    def command(self, line):\n"
+        "        return line[::-1]\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    with SimulatedCamera(source="failing_source:Failing", **SMALL) as simulated:
+        assert simulated.command("source's own") == "nwo s'ecruos"
+        with AravisCamera(CameraConfig("127.0.0.1", timeout_s=0.5)) as camera:
+            camera.start()
+            assert [camera.read().pixels[0, 0] for _ in range(2)] == [2, 3]
+            with pytest.raises(DeviceError, match="stopped answering; check its power and cable"):
+                camera.read()
+        with pytest.raises(DeviceError, match="the lamp broke"):
+            simulated.command("statistics")
+
+
+def test_the_cameras_clock_drifts() -> None:
+    with (
+        SimulatedCamera(drift_ppm=100_000, **SMALL) as simulated,
+        AravisCamera(CameraConfig("127.0.0.1")) as camera,
+    ):
+        camera.start()
+        frames = [camera.read() for _ in range(60)]
+        clock = simulated.clock()
+    device_s = np.array([frame.camera_time_ns for frame in frames]) * 1e-9
+    host_s = np.array([frame.host_time_ns - clock.origin_ns for frame in frames]) * 1e-9
+    rate, _ = np.polyfit(host_s, device_s, 1)
+    assert rate == pytest.approx(1.1, abs=0.03)
+
+
+def in_a_network_of_its_own(script: str) -> str:
+    """Runs a Python script in a network namespace that has nothing but loopback; returns what it prints."""
+    command = [
+        "unshare",
+        "--net",
+        "sh",
+        "-c",
+        'ip link set lo up && exec "$0" -c "$1"',
+        sys.executable,
+        script,
+    ]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=90)
+    if "unshare failed" in result.stderr:
+        pytest.skip("this machine does not permit network namespaces")
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+TOOLS = """
+import subprocess
+from acquisition.simulation.camera import SimulatedCamera
+def run(*command):
+    print(subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True).stdout)
+with SimulatedCamera(width=512, height=384):
+"""
+
+
+@pytest.mark.skipif(
+    shutil.which("arv-tool-0.8") is None or shutil.which("arv-camera-test-0.8") is None,
+    reason="needs Debian's aravis-tools and aravis-tools-cli",
+)
+def test_debians_tools_list_the_camera_and_stream_from_it() -> None:
+    script = (
+        TOOLS
+        + "    run('arv-tool-0.8')\n"
+        + "    run('arv-camera-test-0.8', '-n', '127.0.0.1', '--duration', '2')\n"
+    )
+    lines = in_a_network_of_its_own(script).splitlines()
+    assert lines[0] == "Lucid Vision Labs-PHX050S-Q-SIM00001 (127.0.0.1)"
+    report = dict((part.strip() for part in line.split("=")) for line in lines if line.count("=") == 1)
+    assert report["model name"] == "PHX050S-Q"
+    assert int(report["n_completed_buffers"]) > 10
+    assert int(report["n_error_packets"]) == 0
+
+
+@pytest.mark.skipif(shutil.which("arv-test-0.8") is None, reason="needs Debian's aravis-tools")
+def test_aravis_conformance_suite_passes_but_for_chunks() -> None:
+    report = in_a_network_of_its_own(TOOLS + "    run('arv-test-0.8', '--packet-socket')")
+    failed = [line.split()[0] for line in report.splitlines() if "FAILURE" in line]
+    assert report.count("SUCCESS") >= 14
+    assert failed == ["Chunks:NoSupport"]

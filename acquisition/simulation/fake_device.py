@@ -11,6 +11,7 @@ import errno
 import os
 import socket
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,10 +30,13 @@ GVCP_PORT = 3956
 
 # Fixed by the fake device.
 _SENSOR_WIDTH, _SENSOR_HEIGHT, _WIDTH, _HEIGHT = 0x11C, 0x118, 0x100, 0x104
-_PIXEL_FORMAT, _PERIOD_US, _PACKET_SIZE = 0x128, 0x138, 0xD04
+_PIXEL_FORMAT, _PERIOD_US, _TRIGGER_MODE, _PACKET_SIZE = 0x128, 0x138, 0x300, 0xD04
 _STRINGS = {"vendor": (0x48, 32), "model": (0x68, 32), "version": (0x88, 32), "info": (0xA8, 48)}
 # Ours, as genicam.xml has it.
 _EXPOSURE_AUTO, _AUTO_CONTINUOUS = 0xA000, 2
+
+# The device answers nobody while it waits for its beat.
+_LONGEST_WAIT_US = 250_000
 
 _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
@@ -109,6 +113,7 @@ class FakeDevice:
             )
         self._library.arv_fake_camera_set_trigger_frequency(self._pointer, trigger_poll_hz)
         self._fill = fill
+        self._filled_us = 0
         # Kept: the device calls it as long as it lives.
         self._callback = _FILL(self._on_fill)
         self._library.arv_fake_camera_set_fill_pattern(self._pointer, self._callback, None)
@@ -124,6 +129,21 @@ class FakeDevice:
         self._camera = None
         self._gv = None
 
+    def _fall_into_step(self) -> None:
+        """Delays the first frame of an acquisition to the device's beat.
+
+        Running free, the device sends at whole multiples of the period on the wall clock, but the first frame
+        at once; a camera's frames are equally spaced from the first on.
+        """
+        _, period_us = self._camera.read_register(_PERIOD_US)
+        _, triggered = self._camera.read_register(_TRIGGER_MODE)
+        now_us = time.time_ns() // 1000
+        phase_us = now_us % period_us
+        first = now_us - self._filled_us > 1.5 * period_us and phase_us > period_us / 4
+        if first and not triggered and period_us <= _LONGEST_WAIT_US:
+            time.sleep((period_us - phase_us) * 1e-6)
+        self._filled_us = time.time_ns() // 1000
+
     def _on_fill(self, buffer: int, user: int | None, exposure_us: int, gain: int, code: int) -> None:
         try:
             library = self._library
@@ -136,6 +156,7 @@ class FakeDevice:
                 exposure_us=float(exposure_us),
                 gain_db=gain / 10.0,
             )
+            self._fall_into_step()
             # The size that Aravis could report is that of received data, none here.
             size = exposure.format.size(exposure.height, exposure.width)
             memory = (ctypes.c_uint8 * size).from_address(library.arv_buffer_get_data(buffer, None))

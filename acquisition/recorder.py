@@ -27,7 +27,7 @@ from acquisition.camera import Camera, Trigger
 from acquisition.clocks import FEWEST_SAMPLES, fit_clock
 from acquisition.frame_stream import FrameLedger, FrameStream
 from acquisition.rests import Rest, RestFinder
-from acquisition.robot import PoseSource, Robot
+from acquisition.robot import MotionStopped, PoseSource, Robot
 from acquisition.trace_log import TraceLog
 from dataset.errors import DeviceError, ToolkitError
 from dataset.frames import CameraInfo, RawFrame
@@ -257,12 +257,12 @@ class _Supervisor:
             raise self._error from error
 
     def run(self, motion: Callable[[], object]) -> None:
-        """Runs the motion; what a motion raises because it was stopped when the time was over is no error."""
+        """Runs the motion; that it was stopped when the time was over is no error."""
         self._moving.set()
         try:
             motion()
-        except DeviceError:
-            if not self.over.is_set() or self._stream.failed.is_set():
+        except MotionStopped:
+            if not self.over.is_set():
                 raise
         finally:
             self._moving.clear()
@@ -273,7 +273,7 @@ class _Supervisor:
             try:
                 if not self.over.is_set():
                     self._tick(time.monotonic() - started)
-                # A motion of many moves begins the next when one is stopped: so again and again.
+                # Again and again: a motion may just have been between two moves.
                 if self.over.is_set() and self._moving.is_set() and isinstance(self._robot, Robot):
                     self._robot.stop()
             except Exception as error:  # raised by the thread that leaves the `with` block

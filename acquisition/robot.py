@@ -32,6 +32,10 @@ class EmergencyStop(DeviceError):
     """Somebody pressed an emergency stop."""
 
 
+class MotionStopped(DeviceError):
+    """Another thread stopped the arm with `Robot.stop`: whoever moves it has no further move to make."""
+
+
 @dataclass(frozen=True)
 class RobotConfig:
     """How to reach an arm and how fast it may move.
@@ -161,4 +165,4 @@ class Robot(PoseSource):
 
     @abstractmethod
     def stop(self) -> None:
-        """Brings the arm to rest. May be called from another thread than the one that waits in a move."""
+        """Brings the arm to rest. A move that waits in another thread raises MotionStopped."""

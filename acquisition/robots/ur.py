@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acquisition.robot import PoseSource, Robot, RobotConfig
+from acquisition.robot import MotionStopped, PoseSource, Robot, RobotConfig
 from acquisition.robots.motion_client import MotionClient
 from acquisition.robots.stream import RtdeStream
 from acquisition.simulation.kinematics import forward
@@ -203,7 +203,9 @@ class UrRobot(Robot):
                 while self._motion.ask("moving"):
                     if self._stop_requested.is_set():
                         self._motion.ask("stop", deceleration=_STOP_DECELERATION)
-                        return
+                        raise MotionStopped(
+                            f"the arm {self.config.host} was told to stop on its way; command it anew to go on"
+                        )
                     time.sleep(_POLL_S)
             except (KeyboardInterrupt, SystemExit):
                 self._motion.abort()

@@ -26,11 +26,11 @@ from numpy.typing import ArrayLike
 from acquisition.camera import Camera, Trigger
 from acquisition.clocks import FEWEST_SAMPLES, fit_clock
 from acquisition.frame_stream import FrameLedger, FrameStream
-from acquisition.rests import Rest, RestFinder
 from acquisition.robot import MotionStopped, PoseSource, Robot
 from acquisition.trace_log import TraceLog
 from dataset.errors import DeviceError, ToolkitError
 from dataset.frames import CameraInfo, RawFrame
+from dataset.rests import Rest, RestFinder
 from dataset.session import SessionWriter
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def record_touches(
     """Points touched with the measuring tip, the arm being guided by hand: only reads the arm.
 
     A point is taken whenever the arm is held still for a moment, elsewhere than before. The session holds the
-    trace, in which `rests.find_rests` finds the same points again.
+    trace, in which `dataset.rests.find_rests` finds the same points again.
 
     Args:
         source: connected, without a running trace.

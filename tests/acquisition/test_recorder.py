@@ -19,7 +19,6 @@ from acquisition.camera import CameraConfig
 from acquisition.cameras.aravis import AravisCamera
 from acquisition.frame_stream import NOT_RECEIVED, QUEUE_FULL, UNKNOWN_FRAME_ID, FrameLedger, FrameStream
 from acquisition.recorder import NO_CAMERA, Progress, record_stills, record_stream, record_touches
-from acquisition.rests import find_rests
 from acquisition.robot import RobotConfig
 from acquisition.robots.rtde import RtdeReader
 from acquisition.robots.ur import UrReceiver, UrRobot
@@ -29,6 +28,7 @@ from acquisition.simulation.patterns import MovingPattern
 from acquisition.simulation.robot import SimulatedRobot
 from dataset.errors import DeviceError, SessionError, ToolkitError
 from dataset.frames import RawFrame, RobotTrace
+from dataset.rests import find_rests
 from dataset.session import Chunk, Session, SessionWriter
 from dataset.transforms import SE3, interpolate_poses, rotation_error_deg, translation_error_mm
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from acquisition.rests import RestFinder, find_rests
 from dataset.frames import RobotTrace
+from dataset.rests import RestFinder, find_rests
 from dataset.transforms import SE3, rotation_error_deg
 
 RATE_HZ = 100

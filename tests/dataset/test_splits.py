@@ -1,0 +1,74 @@
+"""Splits: complete, repeatable, and never with near-duplicates on both sides."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dataset import SE3, ToolkitError
+from dataset.splits import by_frame, by_view
+
+FRACTIONS = {"train": 0.7, "val": 0.1, "test": 0.2}
+
+
+def hemisphere(count: int, seed: int = 0) -> SE3:
+    """Cameras on the upper half of a sphere that look at the object, with any roll."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(0.1, 1, count)
+    azimuth = rng.uniform(0, 2 * np.pi, count)
+    radius = np.sqrt(1 - z**2)
+    forward = -np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
+    side = np.cross(forward, [0.3, 0.1, 1.0])
+    side /= np.linalg.norm(side, axis=-1, keepdims=True)
+    rotation = np.stack([side, np.cross(forward, side), forward], axis=-1)
+    return SE3(rotation, -0.5 * forward).inverse()
+
+
+def test_frames_are_divided_completely() -> None:
+    found = by_frame(100, FRACTIONS, seed=1)
+    assert {name: len(indices) for name, indices in found.items()} == {"train": 70, "val": 10, "test": 20}
+    assert np.sort(np.concatenate(list(found.values()))).tolist() == list(range(100))
+    assert all(np.all(np.diff(indices) > 0) for indices in found.values())
+
+
+def test_a_seed_names_a_split() -> None:
+    poses = hemisphere(400)
+    for first, again, other in (
+        (by_frame(100, FRACTIONS, 1), by_frame(100, FRACTIONS, 1), by_frame(100, FRACTIONS, 2)),
+        (by_view(poses, FRACTIONS, 1), by_view(poses, FRACTIONS, 1), by_view(poses, FRACTIONS, 2)),
+    ):
+        assert all(np.array_equal(first[name], again[name]) for name in FRACTIONS)
+        assert not np.array_equal(first["test"], other["test"])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_views_of_different_splits_keep_their_distance(seed: int) -> None:
+    poses = hemisphere(600, seed)
+    found = by_view(poses, FRACTIONS, seed, separation_deg=6.0)
+    views = poses.inverse().translation
+    views = views / np.linalg.norm(views, axis=-1, keepdims=True)
+    for one, other in (("train", "test"), ("train", "val"), ("val", "test")):
+        cosine = views[found[one]] @ views[found[other]].T
+        assert np.rad2deg(np.arccos(cosine.max())) > 6.0
+    assert 0.12 < len(found["test"]) / 600 < 0.28
+    assert len(found["train"]) > 0.35 * 600
+
+
+def test_frames_without_a_pose_join_no_split() -> None:
+    matrices = hemisphere(300).as_matrix()
+    matrices[::3] = np.nan
+    found = by_view(SE3.from_matrix(matrices), {"train": 0.8, "test": 0.2}, seed=0)
+    assert all(np.all(indices % 3 != 0) for indices in found.values())
+
+
+@pytest.mark.parametrize("fractions", [{}, {"train": 0.5}, {"train": 1.2, "test": -0.2}])
+def test_fractions_must_make_sense(fractions: dict[str, float]) -> None:
+    with pytest.raises(ToolkitError, match="must sum to 1"):
+        by_frame(10, fractions, 0)
+
+
+def test_an_empty_split_is_refused() -> None:
+    with pytest.raises(ToolkitError, match="'val' would be empty"):
+        by_frame(3, {"train": 0.9, "val": 0.1}, 0)
+    with pytest.raises(ToolkitError, match="would be empty"):
+        by_view(hemisphere(1), FRACTIONS, 0)

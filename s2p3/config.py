@@ -1,0 +1,251 @@
+"""What an experiment is: one tree of frozen dataclasses, read from and written to experiment.toml.
+
+Two presets. `paper` holds the values the S2P3 paper states (256x256 crops, Adam 1e-4 halved every 25 of 100
+epochs, batch 8 and 4, all loss weights 1, masked inputs). `fast` is our choice: what reaches a usable model
+soonest on two CPU cores. Values the paper does not state are our choice in both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from acquisition import typed_toml
+from dataset.errors import ToolkitError
+
+PhysicsVariant = Literal["dolp", "stokes", "none"]
+
+
+@dataclass(frozen=True)
+class InputConfig:
+    """What the networks see of a frame."""
+
+    size: int = 64
+    """Side of the square network input, pixels."""
+    zoom: float = 1.4
+    """Side of the square region cropped, in units of the longer side of the detected box."""
+    canonical_size: int = 96
+    """Side of the crops kept in memory, from which the network inputs are resampled, pixels."""
+    canonical_zoom: float = 1.9
+    """Region those crops cover, in units of the box: leaves room for zoom, shift and rotation."""
+    aolp: Literal["double_angle", "angle"] = "double_angle"
+    """Angle of polarization as sqrt(DoLP) (cos 2phi, sin 2phi) (our choice), or as the wrapped angle
+    (PPP-Net)."""
+    background: Literal["keep", "mask"] = "keep"
+    """Whether polarization and prior channels outside the predicted mask are zeroed (`mask`: the paper)."""
+
+
+@dataclass(frozen=True)
+class AugmentationConfig:
+    """Augmentation of a crop, in Stokes space, so that the result obeys Malus' law (our choice
+    throughout)."""
+
+    zoom_min: float = 1.2
+    """Smallest region cropped, in units of the box."""
+    zoom_max: float = 1.6
+    """Largest region cropped, in units of the box."""
+    shift: float = 0.12
+    """Largest shift of the region along x and y, in units of the box."""
+    rotation_deg: float = 30.0
+    """Largest in-plane rotation."""
+    noise: float = 0.008
+    """Standard deviation of the added noise at unit intensity; it grows with the root of the intensity."""
+    gain: float = 0.3
+    """Largest relative change of the exposure."""
+    dolp: float = 0.1
+    """Largest relative change of the degree of polarization."""
+    blur: float = 0.5
+    """Probability of a 3x3 blur."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of teacher and student."""
+
+    total_stride: Literal[16, 32] = 16
+    """Stride of the encoders: 32 as published; 16 keeps the layout of small inputs (our choice)."""
+    decoder_channels: int = 64
+    """Width of the teacher's decoder."""
+    head_channels: int = 96
+    """Width of the student's pose head."""
+    head_hidden: int = 96
+    """Hidden units of the student's pose head."""
+    imagenet: bool = True
+    """Start the encoders from ImageNet weights (the paper)."""
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """Supervised training on synthetic sessions."""
+
+    steps: int = 2200
+    """Optimizer steps; with `epochs`, ignored."""
+    epochs: int = 0
+    """Passes through the data; 0: use `steps`."""
+    batch: int = 16
+    learning_rate: float = 1e-3
+    schedule: Literal["cosine", "halving"] = "cosine"
+    """`cosine` with 8 % warm-up (our choice), or `halving` at every quarter (the paper: every 25 of 100
+    epochs)."""
+    weight_decay: float = 1e-2
+    clip_norm: float = 5.0
+    ema: float = 0.98
+    """Decay of the averaged weights, which are the ones kept; 0 keeps the trained weights themselves."""
+    dense_weight: float = 1.0
+    """Weight of the teacher's dense losses (mask, coordinates, normals), our choice; 0: pose supervision
+    only."""
+    warm_start: bool = False
+    """Student: start the encoders from the teacher's instead of ImageNet's."""
+    seed: int = 0
+    checkpoint_every: int = 200
+
+
+@dataclass(frozen=True)
+class DetectorConfig:
+    """The detector: mask and box on a small polarization image (our choice throughout)."""
+
+    level: int = 4
+    """Down-sampling of the polarization image the detector sees."""
+    steps: int = 500
+    batch: int = 8
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-2
+    clip_norm: float = 5.0
+    ema: float = 0.97
+    threshold: float = 0.5
+    """Mask probability above which a pixel belongs to the object."""
+    minimum_score: float = 0.5
+    """Mean mask probability below which nothing is reported."""
+    seed: int = 0
+    checkpoint_every: int = 100
+
+
+@dataclass(frozen=True)
+class SelfSupervisionConfig:
+    """Self-supervised training of the student on captured frames without poses."""
+
+    steps: int = 450
+    """Optimizer steps; with `epochs`, ignored."""
+    epochs: int = 0
+    batch: int = 16
+    learning_rate: float = 3e-4
+    schedule: Literal["cosine", "halving"] = "cosine"
+    weight_decay: float = 0.0
+    clip_norm: float = 2.0
+    ema: float = 0.98
+    pose_weight: float = 0.3
+    mask_weight: float = 20.0
+    normals_weight: float = 2.0
+    physics_weight: float = 2.0
+    physics: PhysicsVariant = "dolp"
+    """`dolp` (the paper's L_physics), `stokes` (DoLP and AoLP, our extension), or `none`."""
+    smoothing: int = 3
+    """Side of the box over which Stokes values are averaged before L_physics: less noise bias; 1 for thin
+    objects."""
+    threshold: float = 0.0
+    """The paper's r: teacher maps are taken as rendered where delta <= r, as predicted elsewhere; 0:
+    `threshold_quantile`."""
+    threshold_quantile: float = 0.08
+    """Sets r to this quantile of delta over the training frames (our choice: the paper does not state r)."""
+    adapt_batches: int = 25
+    """Batches of captured frames on which BatchNorm statistics are re-estimated first (AdaBN); 0: not at
+    all."""
+    adapt_teacher: bool = True
+    """Whether the teacher's BatchNorm statistics are re-estimated too."""
+    seed: int = 0
+    checkpoint_every: int = 150
+
+
+@dataclass(frozen=True)
+class ExperimentConfig:
+    """Everything that decides what a training does, besides its data."""
+
+    input: InputConfig = field(default_factory=InputConfig)
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    teacher: PretrainConfig = field(default_factory=PretrainConfig)
+    student: PretrainConfig = field(default_factory=PretrainConfig)
+    self_supervision: SelfSupervisionConfig = field(default_factory=SelfSupervisionConfig)
+
+    def __post_init__(self) -> None:
+        sizes = [size for size in (64, 128, 256) if size // self.network.total_stride in (4, 8)]
+        if self.input.size not in sizes:
+            raise ToolkitError(
+                f"input.size {self.input.size} does not fit network.total_stride "
+                f"{self.network.total_stride}; "
+                f"use {' or '.join(map(str, sizes))}"
+            )
+        if self.augmentation.zoom_max > self.input.canonical_zoom:
+            raise ToolkitError(
+                "augmentation.zoom_max exceeds input.canonical_zoom; enlarge input.canonical_zoom"
+            )
+
+
+def paper() -> ExperimentConfig:
+    """The paper's stated values; the rest is our choice."""
+    pretraining = PretrainConfig(
+        epochs=100,
+        batch=8,
+        learning_rate=1e-4,
+        schedule="halving",
+        weight_decay=0.0,
+        ema=0.0,
+        dense_weight=0.0,
+    )
+    return ExperimentConfig(
+        input=InputConfig(size=256, canonical_size=256, background="mask"),
+        network=NetworkConfig(total_stride=32),
+        teacher=pretraining,
+        student=pretraining,
+        self_supervision=SelfSupervisionConfig(
+            epochs=100,
+            batch=4,
+            learning_rate=1e-4,
+            schedule="halving",
+            ema=0.0,
+            pose_weight=1.0,
+            mask_weight=1.0,
+            normals_weight=1.0,
+            physics_weight=1.0,
+            smoothing=1,
+            adapt_batches=0,
+            adapt_teacher=False,
+        ),
+    )
+
+
+def fast() -> ExperimentConfig:
+    """Our choice for two CPU cores: 64x64 crops, about ten minutes a network."""
+    return ExperimentConfig()
+
+
+def quick() -> ExperimentConfig:
+    """Our smoke-test choice: every stage runs, in seconds; the recall is poor."""
+    base = fast()
+    return dataclasses.replace(
+        base,
+        detector=dataclasses.replace(base.detector, steps=60),
+        teacher=dataclasses.replace(base.teacher, steps=80),
+        student=dataclasses.replace(base.student, steps=80),
+        self_supervision=dataclasses.replace(base.self_supervision, steps=30, adapt_batches=5),
+    )
+
+
+PRESETS = {"paper": paper, "fast": fast, "quick": quick}
+
+
+def load(path: str | Path) -> ExperimentConfig:
+    """Reads experiment.toml; fields left out keep the values of `fast`.
+
+    Raises ToolkitError: a missing file, an unknown field (with the nearest valid one), a wrong type, values
+    that do not fit.
+    """
+    return typed_toml.load(ExperimentConfig, path, hint="check the path, or leave it out for the fast preset")
+
+
+def save(config: ExperimentConfig, path: str | Path) -> None:
+    """Writes `config` as TOML that `load` reads back equal."""
+    Path(path).write_text(typed_toml.dumps(config), encoding="utf-8")

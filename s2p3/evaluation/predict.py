@@ -1,0 +1,93 @@
+"""From one polarization image to one pose: detect, crop, estimate. The way every evaluated frame takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dataset import SE3, Intrinsics
+from s2p3.config import DetectorConfig, ExperimentConfig
+from s2p3.inputs import View
+from s2p3.networks.detector import Detection, Detector, detect
+from s2p3.networks.pose_head import decode_pose
+from s2p3.networks.student import Student
+from s2p3.networks.teacher import Teacher, TeacherOutput
+from s2p3.training import checkpoint
+from s2p3.training.batches import form_input
+from s2p3.training.checkpoint import CheckpointInfo
+from s2p3.training.crops import single_crop
+from s2p3.training.detection import load_detector
+from s2p3.training.pretrain import load_student, load_teacher
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """A pose and what it came from.
+
+    Attributes:
+        T_cam_obj: one pose.
+        score: the detection's, 0 to 1.
+        detection: box and mask it was estimated in.
+    """
+
+    T_cam_obj: SE3
+    score: float
+    detection: Detection
+
+
+@dataclass(frozen=True, eq=False)
+class Finder:
+    """A trained detector with its settings: Stokes image to `Detection`."""
+
+    network: Detector
+    settings: DetectorConfig
+
+    @staticmethod
+    def load(path: Path, object_name: str | None = None) -> Finder:
+        """Reads a checkpoint. Raises ToolkitError as `checkpoint.read_info`."""
+        network, info = load_detector(path, object_name)
+        return Finder(network, info.config.detector)
+
+    def __call__(self, stokes: NDArray[np.float32]) -> Detection | None:
+        """`stokes` (3, H, W), undistorted."""
+        settings = self.settings
+        return detect(self.network, stokes, settings.level, settings.threshold, settings.minimum_score)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """A trained teacher or student: Stokes image and detection to pose."""
+
+    network: Teacher | Student
+    info: CheckpointInfo
+
+    @staticmethod
+    def load(path: Path, object_name: str | None = None) -> Estimator:
+        """Reads a teacher's or a student's checkpoint. Raises ToolkitError as `checkpoint.read_info`."""
+        if checkpoint.read_info(path).kind == "teacher":
+            return Estimator(*load_teacher(path, object_name))
+        return Estimator(*load_student(path, object_name))
+
+    @torch.no_grad()
+    def __call__(
+        self, stokes: NDArray[np.float32], detection: Detection, intrinsics: Intrinsics
+    ) -> PoseEstimate:
+        """Estimates the pose of what was detected.
+
+        Args:
+            stokes: (3, H, W), undistorted.
+            intrinsics: of that image, a pinhole.
+        """
+        config: ExperimentConfig = self.info.config
+        crop = single_crop(stokes, detection, intrinsics, config.input)
+        view = View.centred(1, config.input.zoom)
+        seen = form_input(crop, torch.tensor([0]), view, self.info.refractive_index, config)
+        output = self.network(seen.polarization, seen.priors)
+        pose = output.pose if isinstance(output, TeacherOutput) else output
+        rotation, translation, _ = decode_pose(pose, seen.K, seen.size, self.info.diameter_m)
+        T_cam_obj = SE3(rotation[0].double().numpy(), translation[0].double().numpy())
+        return PoseEstimate(T_cam_obj, detection.score, detection)

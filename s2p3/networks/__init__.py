@@ -1,0 +1,7 @@
+"""Teacher, student and detector: plain torch modules, each readable top to bottom."""
+
+from s2p3.networks.detector import Detection, Detector, detect
+from s2p3.networks.student import Student
+from s2p3.networks.teacher import Teacher, TeacherOutput
+
+__all__ = ["Detection", "Detector", "Student", "Teacher", "TeacherOutput", "detect"]

@@ -1,0 +1,17 @@
+"""Training: sessions to crops, crops to batches, batches to checkpoints."""
+
+from s2p3.training.crops import Crops, LabelledCrops, captured_crops, labelled_crops
+from s2p3.training.detection import train_detector
+from s2p3.training.pretrain import train_student, train_teacher
+from s2p3.training.self_supervised import self_supervise
+
+__all__ = [
+    "Crops",
+    "LabelledCrops",
+    "captured_crops",
+    "labelled_crops",
+    "self_supervise",
+    "train_detector",
+    "train_student",
+    "train_teacher",
+]

@@ -1,0 +1,110 @@
+"""Checkpoints: weights in NAME.safetensors, and what they are in NAME.json beside it. No pickles."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from acquisition import typed_toml
+from dataset.errors import ToolkitError
+from s2p3.config import ExperimentConfig
+from s2p3.objects import ObjectModel
+
+Kind = Literal["teacher", "student", "detector"]
+Network = TypeVar("Network", bound=nn.Module)
+FORMAT = "s2p3-checkpoint-1"
+
+
+@dataclass(frozen=True)
+class CheckpointInfo:
+    """What a checkpoint holds besides weights.
+
+    Attributes:
+        kind: of network.
+        stage: "pretrained" or "self-supervised".
+        object_name, diameter_m, refractive_index: of the object it was trained for.
+        step: optimizer steps taken.
+        config: the whole experiment.
+        data: fingerprint of the training data.
+    """
+
+    kind: Kind
+    stage: str
+    object_name: str
+    diameter_m: float
+    refractive_index: float
+    step: int
+    config: ExperimentConfig
+    data: str
+
+    @staticmethod
+    def of(
+        kind: Kind, stage: str, model: ObjectModel, step: int, config: ExperimentConfig, data: str
+    ) -> CheckpointInfo:
+        """The info of a network trained for `model`."""
+        return CheckpointInfo(
+            kind, stage, model.name, model.diameter, model.refractive_index, step, config, data
+        )
+
+
+def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
+    """Writes `path` (NAME.safetensors) and NAME.json, the weights last and atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    description = {"format": FORMAT, **asdict(info), "config": typed_toml.dumps(info.config)}
+    path.with_suffix(".json").write_text(json.dumps(description, indent=1), encoding="utf-8")
+    save_tensors(path, weights)
+
+
+def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Writes a safetensors file atomically: a reader sees the old file or the new one."""
+    temporary = path.with_name(path.name + ".part")
+    save_file({name: tensor.detach().contiguous() for name, tensor in tensors.items()}, temporary, metadata)
+    temporary.replace(path)
+
+
+def read_info(path: Path, kind: Kind | None = None, object_name: str | None = None) -> CheckpointInfo:
+    """Reads NAME.json of the checkpoint `path`.
+
+    Raises ToolkitError: missing or foreign files, a network of another kind than `kind`, of another object
+    than `object_name`.
+    """
+    description = path.with_suffix(".json")
+    for needed in (path, description):
+        if not needed.is_file():
+            raise ToolkitError(
+                f"{needed}: no such file; a checkpoint is NAME.safetensors with NAME.json beside it"
+            )
+    try:
+        values: dict[str, Any] = json.loads(description.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ToolkitError(f"{description}: not JSON ({error}); train again or restore the file") from error
+    if values.pop("format", None) != FORMAT:
+        raise ToolkitError(f"{description}: not a checkpoint this version reads ({FORMAT}); train again")
+    config = typed_toml.loads(ExperimentConfig, values.pop("config"), source=str(description))
+    info = CheckpointInfo(config=config, **values)
+    if kind is not None and info.kind != kind:
+        raise ToolkitError(f"{path}: holds a {info.kind}, not a {kind}; give the {kind}'s checkpoint")
+    if object_name is not None and info.object_name != object_name:
+        raise ToolkitError(
+            f"{path}: was trained for {info.object_name!r}, not {object_name!r}; "
+            f"train a {info.kind} for {object_name!r}"
+        )
+    return info
+
+
+def load_weights(network: Network, path: Path) -> Network:
+    """Fills `network` with the weights at `path`, puts it in evaluation mode, and returns it.
+
+    Raises ToolkitError: the weights do not fit the network.
+    """
+    try:
+        network.load_state_dict(load_file(path))
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise ToolkitError(f"{path}: does not fit this network ({reason}); train again") from error
+    return network.eval()

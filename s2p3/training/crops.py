@@ -1,0 +1,219 @@
+"""From sessions to canonical crops in memory: read once, resampled thousands of times.
+
+Two kinds, kept apart by type. `Crops` holds what can be had of a captured frame without its pose: Stokes
+values in a predicted box, and the predicted mask. `LabelledCrops` adds the truth of a synthetic (or
+annotated) session.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file
+from torch import Tensor
+
+from dataset import SE3, Intrinsics
+from dataset.errors import ToolkitError
+from dataset.session import Session
+from s2p3.config import InputConfig
+from s2p3.inputs import crop_intrinsics, extract_crop, square_box
+from s2p3.networks.detector import Detection
+from s2p3.objects import ObjectModel, Symmetry
+from s2p3.rendering import rasterize
+from s2p3.training.checkpoint import save_tensors
+from s2p3.training.progress import OnStep, progress_bar
+
+_MINIMUM_VISIBLE = 0.3  # our choice: frames that show less of the object than this are not trained on
+
+
+@dataclass(frozen=True)
+class Crops:
+    """N upright canonical crops of side P.
+
+    Attributes:
+        stokes: (N, 3, P, P) float16.
+        mask: (N, 1, P, P) float16, 0 to 1: predicted, or the visible mask where the truth is known.
+        K: (N, 3, 3) float32, intrinsics of the crops.
+        frames: (N,) int64, frame index in the session (or position in the list of sessions' frames).
+    """
+
+    stokes: Tensor
+    mask: Tensor
+    K: Tensor
+    frames: Tensor
+
+    def __len__(self) -> int:
+        return len(self.stokes)
+
+
+@dataclass(frozen=True)
+class LabelledCrops(Crops):
+    """Crops with their truth.
+
+    Attributes:
+        rotation, translation: (N, 3, 3) and (N, 3) of T_cam_obj; for an object with a symmetry axis, of the
+            equivalent pose whose turn about the axis is fixed by the viewing direction.
+        normals: (N, 3, P, P) float16, camera frame, zero outside the object.
+        coordinates: (N, 3, P, P) float16, -1 to 1 across the object's bounding box, zero outside.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    normals: Tensor
+    coordinates: Tensor
+
+
+def fingerprint(paths: Sequence[Path], model: ObjectModel, config: InputConfig) -> str:
+    """A short hash of which sessions (by id and length), which object and which crops."""
+    digest = hashlib.sha256(f"{model.name} {config}".encode())
+    for path in paths:
+        with Session.open(path) as session:
+            digest.update(f"{session.session_id} {len(session)}".encode())
+    return digest.hexdigest()[:16]
+
+
+def labelled_crops(
+    paths: Sequence[Path],
+    model: ObjectModel,
+    config: InputConfig,
+    cache: Path | None = None,
+    on_step: OnStep | None = None,
+) -> LabelledCrops:
+    """The crops of every frame of `paths` that shows the object, with dense targets drawn by the rasterizer.
+
+    Args:
+        paths: sessions with poses of the object.
+        cache: folder in which the crops are kept for the next call with the same data and settings.
+
+    Raises ToolkitError: a session lacks the object, or no frame shows it.
+    """
+    stored = None if cache is None else cache / f"crops-{fingerprint(paths, model, config)}.safetensors"
+    if stored is not None and stored.exists():
+        return LabelledCrops(**load_file(stored))
+    rows: list[dict[str, NDArray[np.generic]]] = []
+    with progress_bar(f"crops of {model.name}", 1) as bar:
+        report = on_step or bar
+        for path in paths:
+            with Session.open(path) as session:
+                intrinsics = session.working_intrinsics
+                poses = session.object_poses(model.name)
+                for index in range(len(session)):
+                    mask = poses.mask(index)
+                    if poses.visible_fraction[index] >= _MINIMUM_VISIBLE and mask.any():
+                        stokes = session.stokes(index).stack()
+                        crop = _crop(stokes, mask, mask_box(mask), intrinsics, config, len(rows))
+                        rows.append(
+                            crop | _truth(crop["K"], mask, poses.T_cam_obj[index], intrinsics, model, config)
+                        )
+                    report(index + 1, len(session), {})
+    if not rows:
+        raise ToolkitError(
+            f"{', '.join(map(str, paths))}: no frame shows {model.name!r}; annotate or synthesize first"
+        )
+    tensors = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
+    if stored is not None:
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        save_tensors(stored, tensors)
+    return LabelledCrops(**tensors)
+
+
+def captured_crops(
+    session: Session, indices: Sequence[int], detections: Sequence[Detection | None], config: InputConfig
+) -> Crops:
+    """The crops of captured frames at their predicted boxes; frames without a detection are left out.
+
+    Reads the Stokes images and the intrinsics of `session`, nothing else.
+
+    Raises ToolkitError: the object was detected in no frame.
+    """
+    rows = [
+        _crop(
+            session.stokes(index).stack(),
+            found.mask,
+            found.box_xywh,
+            session.working_intrinsics,
+            config,
+            index,
+        )
+        for index, found in zip(indices, detections, strict=True)
+        if found is not None
+    ]
+    if not rows:
+        raise ToolkitError(
+            "the detector found the object in none of the frames given; "
+            "train it longer, or on scenes closer to these"
+        )
+    return Crops(**{name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]})
+
+
+def single_crop(
+    stokes: NDArray[np.float32], found: Detection, intrinsics: Intrinsics, config: InputConfig
+) -> Crops:
+    """The crop (N = 1) of one undistorted Stokes image (3, H, W) at a predicted box."""
+    row = _crop(stokes, found.mask, found.box_xywh, intrinsics, config, 0)
+    return Crops(**{name: torch.from_numpy(value[None]) for name, value in row.items()})
+
+
+def mask_box(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(4,) box x, y, w, h of a mask (H, W), pixel-edge coordinates. The mask must not be empty."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    left, top = columns[0], rows[0]
+    return np.array([left, top, columns[-1] + 1 - left, rows[-1] + 1 - top], dtype=np.float64)
+
+
+def canonical_pose(pose: SE3, symmetry: Symmetry) -> SE3:
+    """The pose among those a symmetry axis makes equivalent that shows the camera on a fixed side; others as
+    they are."""
+    if symmetry.axis is None:
+        return pose
+    axis = symmetry.axis
+    towards = pose.inverse().translation
+    towards = towards - axis * (axis @ towards)
+    side = np.linalg.svd(axis[None])[2][1]  # any fixed direction across the axis
+    turn = np.arctan2(axis @ np.cross(side, towards), side @ towards)
+    return pose @ SE3.from_rotvec(axis * turn, np.zeros(3))
+
+
+def _crop(
+    stokes: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    box: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    config: InputConfig,
+    frame: int,
+) -> dict[str, NDArray[np.generic]]:
+    region = square_box(box, config.canonical_zoom)
+    image = np.concatenate([stokes, mask[None].astype(np.float32)])
+    crop = extract_crop(image, region, config.canonical_size).astype(np.float16)
+    return {
+        "stokes": crop[:3],
+        "mask": crop[3:],
+        "K": crop_intrinsics(intrinsics, region, config.canonical_size),
+        "frames": np.array(frame, dtype=np.int64),
+    }
+
+
+def _truth(
+    K: NDArray[np.generic],
+    mask: NDArray[np.bool_],
+    T_cam_obj: SE3,
+    intrinsics: Intrinsics,
+    model: ObjectModel,
+    config: InputConfig,
+) -> dict[str, NDArray[np.generic]]:
+    pose = canonical_pose(T_cam_obj, model.symmetry)
+    region = square_box(mask_box(mask), config.canonical_zoom)
+    raster = rasterize(model.mesh, pose, intrinsics.crop(region, config.canonical_size))
+    inside = raster.mask[None]
+    return {
+        "rotation": pose.rotation.astype(np.float32),
+        "translation": pose.translation.astype(np.float32),
+        "normals": np.moveaxis(raster.normals, -1, 0).astype(np.float16) * inside,
+        "coordinates": np.moveaxis(2 * raster.nocs - 1, -1, 0).astype(np.float16) * inside,
+    }

@@ -1,0 +1,205 @@
+"""Trains the detector on labelled sessions, at the down-sampled image the detector sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dataset.errors import ToolkitError
+from dataset.session import Session
+from s2p3.config import DetectorConfig, ExperimentConfig
+from s2p3.inputs import rotate_stokes
+from s2p3.networks.detector import CELL, Detector, detector_input, downsample
+from s2p3.networks.lite0 import channels_last
+from s2p3.objects import ObjectModel
+from s2p3.training import checkpoint
+from s2p3.training.checkpoint import CheckpointInfo
+from s2p3.training.crops import fingerprint
+from s2p3.training.loop import LoopConfig, Losses, optimize, sample_indices
+from s2p3.training.progress import OnStep, progress_bar
+
+# Ranges of the augmentation, our choice: wide, because the captured domain is not known.
+_SCALE = (0.75, 1.35)
+_ROTATION_DEG = 20.0
+_SHIFT = 0.15
+_GAIN = 0.5
+_DOLP = 0.3
+_NOISE = 0.02
+_SHADE = 0.5
+_BACKGROUND_POLARIZATION = 0.15
+_COARSE = 4  # side of the random fields of shade and background polarization, before they are smoothed
+
+
+@dataclass(frozen=True)
+class SmallFrames:
+    """N whole images, down-sampled.
+
+    Attributes:
+        stokes: (N, 3, h, w) float16.
+        masks: (N, classes, h, w) float16, 0 to 1.
+    """
+
+    stokes: Tensor
+    masks: Tensor
+
+    def __len__(self) -> int:
+        return len(self.stokes)
+
+
+def small_frames(
+    paths: Sequence[Path], object_name: str, level: int, on_step: OnStep | None = None
+) -> SmallFrames:
+    """Every frame of `paths`, down-sampled by `level`, with the object's visible mask as the only class."""
+    stokes, masks = [], []
+    with progress_bar(f"frames with {object_name}", 1) as bar:
+        report = on_step or bar
+        for path in paths:
+            with Session.open(path) as session:
+                poses = session.object_poses(object_name)
+                for index in range(len(session)):
+                    image = torch.from_numpy(session.stokes(index).stack())
+                    mask = torch.from_numpy(poses.mask(index).astype(np.float32))[None]
+                    stokes.append(downsample(image[None], level)[0].half())
+                    masks.append(downsample(mask[None], level)[0].half())
+                    report(index + 1, len(session), {})
+    if not stokes:
+        raise ToolkitError(f"{', '.join(map(str, paths))}: no frames; synthesize or record some first")
+    return SmallFrames(torch.stack(stokes), torch.stack(masks))
+
+
+def train_detector(
+    sessions: Sequence[Path],
+    model: ObjectModel,
+    config: ExperimentConfig,
+    out: Path,
+    on_step: OnStep | None = None,
+) -> Path:
+    """Trains a detector of `model` and writes `out`/detector.safetensors, which is returned.
+
+    Args:
+        sessions: with poses and masks of the object, usually synthetic.
+        on_step: see `loop.optimize`.
+
+    Raises ToolkitError: a session lacks the object; see also `loop.optimize`.
+    """
+    settings = config.detector
+    path = out / "detector.safetensors"
+    data = fingerprint(sessions, model, config.input)
+    frames = small_frames(sessions, model.name, settings.level)
+    torch.manual_seed(settings.seed)
+    network = channels_last(Detector(frames.masks.shape[1], config.network.imagenet))
+
+    def loss_at(generator: torch.Generator) -> Losses:
+        stokes, masks = augment_frames(
+            frames, sample_indices(len(frames), settings.batch, generator), generator
+        )
+        logits, distances = network(detector_input(stokes))
+        return detector_losses(logits, distances, masks)
+
+    run = f"{data} {settings}"
+    trained = optimize(network, loss_at, _loop(settings), path, run, "detector", on_step)
+    info = CheckpointInfo.of("detector", "pretrained", model, settings.steps, config, data)
+    checkpoint.save(path, trained.state_dict(), info)
+    return path
+
+
+def load_detector(path: Path, object_name: str | None = None) -> tuple[Detector, CheckpointInfo]:
+    """Reads a detector. Raises ToolkitError as `checkpoint.read_info` and `checkpoint.load_weights`."""
+    info = checkpoint.read_info(path, "detector", object_name)
+    network = checkpoint.load_weights(Detector(imagenet=False), path)
+    return channels_last(network), info
+
+
+def detector_losses(logits: Tensor, distances: Tensor, masks: Tensor) -> Losses:
+    """Binary cross entropy and soft Dice of the masks, and the L1 of the box distances, in box sides, over
+    mask cells.
+
+    Args:
+        logits: (B, classes, h/2, w/2), distances: (B, 4, h/2, w/2), of a possibly padded image.
+        masks: (B, classes, h, w); the box is that of all classes together (one object an image).
+    """
+    height, width = logits.shape[2:]
+    padded = F.pad(masks, (0, width * CELL - masks.shape[3], 0, height * CELL - masks.shape[2]))
+    target = F.avg_pool2d(padded, CELL)
+    entropy = F.binary_cross_entropy_with_logits(logits, target)
+    probability = logits.sigmoid()
+    overlap = 2 * (probability * target).sum((1, 2, 3)) + 1
+    dice = (1 - overlap / (probability.sum((1, 2, 3)) + target.sum((1, 2, 3)) + 1)).mean()
+    true_distances, side = box_distances(padded.amax(1) > 0.5, (height, width))
+    inside = (target.amax(1, keepdim=True) > 0.5).float()
+    error = (distances - true_distances).abs().mean(1, keepdim=True) / side[:, None, None, None]
+    box = (error * inside).sum() / (inside.sum() + 1)
+    return {"total": 4 * entropy + dice + 2 * box, "entropy": entropy, "dice": dice, "box": box}
+
+
+def box_distances(mask: Tensor, cells: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Distances (B, 4, *cells) from every cell's centre to the left, top, right and bottom of the mask's box,
+    and the longer side of the box (B,), all in pixels of the mask (B, h, w); an empty mask gives a box of the
+    whole image."""
+    _, height, width = mask.shape
+    columns, rows = mask.any(1), mask.any(2)
+    empty = ~columns.any(1)
+    columns, rows = columns | empty[:, None], rows | empty[:, None]
+    left, right = columns.int().argmax(1), width - columns.flip(1).int().argmax(1)
+    top, bottom = rows.int().argmax(1), height - rows.flip(1).int().argmax(1)
+    y = (CELL * (torch.arange(cells[0]) + 0.5)).view(1, -1, 1).expand(len(mask), -1, cells[1])
+    x = (CELL * (torch.arange(cells[1]) + 0.5)).view(1, 1, -1).expand(len(mask), cells[0], -1)
+    edges = [edge.view(-1, 1, 1).float() for edge in (left, top, right, bottom)]
+    distances = torch.stack([x - edges[0], y - edges[1], edges[2] - x, edges[3] - y], dim=1)
+    return distances, torch.maximum(right - left, bottom - top).float().clamp_min(1)
+
+
+def augment_frames(frames: SmallFrames, indices: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Random scale, rotation and shift of whole images, with shading, exposure, DoLP, noise, and a polarized
+    background.
+
+    Returns Stokes images (B, 3, h, w) and masks (B, classes, h, w).
+    """
+    batch = len(indices)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(batch, *shape, generator=generator)
+
+    stokes, masks = frames.stokes[indices].float(), frames.masks[indices].float()
+    height, width = stokes.shape[2:]
+    angle = uniform(-1, 1) * math.radians(_ROTATION_DEG)
+    scale, shift = uniform(*_SCALE), uniform(-_SHIFT, _SHIFT, 2)
+    cos, sin, aspect = angle.cos() / scale, angle.sin() / scale, width / height
+    rows = [cos, sin / aspect, shift[:, 0], -sin * aspect, cos, shift[:, 1]]
+    grid = F.affine_grid(torch.stack(rows, dim=1).view(-1, 2, 3), list(stokes.shape), align_corners=False)
+    stokes = F.grid_sample(stokes, grid, padding_mode="reflection", align_corners=False)
+    masks = F.grid_sample(masks, grid, padding_mode="zeros", align_corners=False)
+    stokes = rotate_stokes(stokes, angle)
+
+    def field(channels: int, amplitude: float) -> Tensor:
+        coarse = uniform(-amplitude, amplitude, channels, _COARSE, _COARSE)
+        return F.interpolate(coarse, (height, width), mode="bicubic", align_corners=False)
+
+    background = (1 - masks.amax(1, keepdim=True)) * uniform(0, 1, 1, 1, 1)
+    s0 = stokes[:, :1]
+    polarized = stokes[:, 1:] * uniform(1 - _DOLP, 1 + _DOLP, 1, 1, 1)
+    polarized = polarized + background * s0 * field(2, _BACKGROUND_POLARIZATION)
+    stokes = torch.cat([s0, polarized], dim=1) * (field(1, _SHADE) * uniform(0, 1, 1, 1, 1)).exp()
+    stokes = stokes * uniform(1 - _GAIN, 1 + _GAIN, 1, 1, 1)
+    noise = torch.randn(stokes.shape, generator=generator) * s0.clamp_min(0).sqrt()
+    return stokes + uniform(0, _NOISE, 1, 1, 1) * noise, masks
+
+
+def _loop(settings: DetectorConfig) -> LoopConfig:
+    return LoopConfig(
+        settings.steps,
+        settings.learning_rate,
+        "cosine",
+        settings.weight_decay,
+        settings.clip_norm,
+        settings.ema,
+        settings.seed,
+        settings.checkpoint_every,
+    )

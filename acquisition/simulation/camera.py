@@ -195,7 +195,8 @@ def _parse() -> argparse.Namespace:
     add("--height", type=int, default=2048, help="rows of the sensor, a multiple of 4")
     add("--pixel-format", default="BayerRG8", help="PFNC name of the format at power-on")
     add("--frame-rate", type=float, default=22.0, help="frames per second at power-on")
-    add("--packet-size", type=int, default=9000, help="bytes of a stream packet at power-on")
+    # The largest that GigE Vision has, nearly: a socket's buffer holds more in fewer, larger packets.
+    add("--packet-size", type=int, default=16000, help="bytes of a stream packet at power-on")
     add("--latency-s", type=float, default=0.02, help="from the start of the exposure to the first packet")
     add("--drift-ppm", type=float, default=0.0, help="how much too fast the camera's clock runs")
     add("--trigger-poll-hz", type=float, default=100.0, help="how often the device looks for a trigger")

@@ -1,0 +1,182 @@
+"""The differentiable renderer: the rasterizer's values, exact interior gradients, silhouettes that move."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from dataset import SE3, Intrinsics
+from s2p3 import object_meshes, objects
+from s2p3.rendering import Mesh, rasterize
+from s2p3.rendering.differentiable import RenderMesh, render, render_reference
+
+SIZE = 128
+
+
+@pytest.fixture(scope="module", params=objects.NAMES)
+def model(request: pytest.FixtureRequest) -> objects.ObjectModel:
+    return objects.build(request.param)
+
+
+def _views(
+    model: objects.ObjectModel, count: int, seed: int, zoom: float = 0.75
+) -> tuple[Tensor, Tensor, Tensor]:
+    R = torch.from_numpy(Rotation.random(count, random_state=seed).as_matrix()).float()
+    t = torch.tensor([[0.01, -0.02, 0.6]]).repeat(count, 1)
+    f = SIZE * 0.6 * zoom / model.diameter
+    K = torch.tensor([[f, 0, SIZE / 2], [0, f, SIZE / 2 - 1], [0, 0, 1]]).repeat(count, 1, 1)
+    return R, t, K
+
+
+def _rotate(w: Tensor) -> Tensor:
+    x, y, z = w.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).view(-1, 3, 3))
+
+
+def test_values_are_the_rasterizers(model: objects.ObjectModel) -> None:
+    R, t, K = _views(model, 2, seed=1)
+    output = render(RenderMesh.from_mesh(model.mesh), R, t, K, SIZE, SIZE)
+    for b in range(2):
+        camera = Intrinsics(K[b].numpy(), np.zeros(0), SIZE, SIZE)
+        raster = rasterize(model.mesh, SE3(R[b].double().numpy(), t[b].double().numpy()), camera)
+        same = output.mask[b, 0].numpy() == raster.mask
+        assert same.mean() > 0.9995
+        both = raster.mask & same
+        facing = -(raster.normals * camera.rays()).sum(axis=-1) > 0.1
+        for image, expected, tolerance in (
+            (output.normals, raster.normals, 2e-3),
+            (output.nocs, raster.nocs, 1e-3),
+            (output.depth, raster.depth[..., None], 1e-4),
+        ):
+            error = np.abs(image[b].permute(1, 2, 0).numpy() - expected)[both & facing]
+            assert np.quantile(error, 0.995) < tolerance
+
+
+def test_the_fast_path_equals_the_reference_with_gradients(model: objects.ObjectModel) -> None:
+    mesh = RenderMesh.from_mesh(model.mesh)
+    R, t, K = (x.double() for x in _views(model, 3, seed=2, zoom=1.3))  # zoomed in: cut by the image's border
+    weights = torch.randn(3, 11, SIZE, SIZE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    results = []
+    for function in (render, render_reference):
+        pose = R.clone().requires_grad_(), t.clone().requires_grad_()
+        o = function(mesh, *pose, K, SIZE, SIZE)
+        images = torch.cat([o.mask, o.normals, o.normals_interior, o.depth, o.nocs], dim=1)
+        (images * weights).sum().backward()
+        results.append((images.detach(), pose[0].grad, pose[1].grad))
+    for fast, reference in zip(*results, strict=True):
+        assert fast is not None
+        assert reference is not None
+        torch.testing.assert_close(fast, reference, rtol=1e-4, atol=2e-5)
+
+
+def test_interior_gradients_pass_gradcheck() -> None:
+    corners = [[-9.0, -8, 0.1], [11, -9, -0.2], [0, 12, 0]]
+    mesh = Mesh.from_arrays(
+        [*corners, [0, 0, 5.0]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], crease_deg=180
+    )
+    triangle = RenderMesh.from_mesh(mesh)
+    K = torch.tensor([[[8.0, 0, 3], [0, 8, 2], [0, 0, 1]]], dtype=torch.float64)
+
+    def images(w: Tensor, t: Tensor) -> tuple[Tensor, ...]:
+        output = render(triangle, _rotate(w[None]), t[None], K, 6, 7)
+        return output.normals, output.normals_interior, output.depth, output.nocs
+
+    w = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64, requires_grad=True)
+    t = torch.tensor([0.2, 0.1, 4.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(images, (w, t), eps=1e-5, atol=1e-4)
+
+
+def _mask_loss(
+    mesh: RenderMesh, pose: tuple[Tensor, Tensor, Tensor], step: Tensor, weight: Tensor, oversample: int
+) -> Tensor:
+    R, t, K = pose
+    K = K.clone()
+    K[:, :2] *= oversample
+    K[:, :2, 2] += (oversample - 1) / 2
+    side = SIZE * oversample
+    turned = _rotate(step[None, :3]) @ R
+    mask = render(mesh, turned, t + step[None, 3:], K, side, side).mask
+    return (torch.nn.functional.avg_pool2d(mask, oversample) * weight).sum()
+
+
+def test_silhouette_gradients_follow_finite_differences(model: objects.ObjectModel) -> None:
+    mesh, views = RenderMesh.from_mesh(model.mesh), 6
+    gradients, differences = [], []
+    for seed in range(views):
+        pose = _views(model, 1, seed)
+        rough = torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(seed))
+        weight = torch.nn.functional.interpolate(rough, (SIZE, SIZE), mode="bicubic")
+        step = torch.zeros(6, requires_grad=True)
+        (gradient,) = torch.autograd.grad(_mask_loss(mesh, pose, step, weight, 1), step)
+        gradients.append(gradient)
+        sizes = torch.tensor([0.01] * 3 + [0.003 * model.diameter] * 3)
+        with torch.no_grad():
+            change = [
+                _mask_loss(mesh, pose, d, weight, 4) - _mask_loss(mesh, pose, -d, weight, 4)
+                for d in torch.diag(sizes)
+            ]
+        differences.append(torch.stack(change) / (2 * sizes))
+    ours, theirs = torch.stack(gradients), torch.stack(differences)
+    for part in (slice(0, 3), slice(3, 6)):
+        a, b = ours[:, part].flatten(), theirs[:, part].flatten()
+        assert torch.nn.functional.cosine_similarity(a, b, dim=0) > 0.97
+        assert 0.9 < float(a.norm() / b.norm()) < 1.1
+
+
+def test_a_ball_that_comes_nearer_grows_and_one_that_turns_keeps_its_outline() -> None:
+    ball = RenderMesh.from_mesh(Mesh.from_arrays(*object_meshes.ellipsoid((0.2, 0.2, 0.2)), crease_deg=60))
+    w = torch.zeros(1, 3, requires_grad=True)
+    t = torch.tensor([[0.0, 0, 0.6]], requires_grad=True)
+    K = torch.tensor([[[150.0, 0, 63], [0, 150, 63], [0, 0, 1]]])
+    mask = render(ball, _rotate(w), t, K, SIZE, SIZE).mask
+    area = float(mask.detach().sum())
+    across = torch.linspace(-1, 1, SIZE).expand(SIZE, SIZE)
+    (growth,) = torch.autograd.grad(mask.sum(), t, retain_graph=True)
+    turning, moving = torch.autograd.grad((mask * across).sum(), (w, t))
+    assert float(growth[0, 2]) == pytest.approx(-2 * 0.6 * area / (0.6**2 - 0.1**2), rel=0.05)
+    assert (
+        float(turning.abs().max()) < 0.05 * float(moving.abs().max()) * 0.1
+    )  # as if its points were its rim
+
+
+def test_without_silhouettes_the_mask_is_constant() -> None:
+    model = objects.build("cup")
+    R, t, K = _views(model, 1, seed=4)
+    t = t.requires_grad_()
+    output = render(RenderMesh.from_mesh(model.mesh), R, t, K, SIZE, SIZE, silhouette=False)
+    (gradient,) = torch.autograd.grad(output.mask.sum(), t)
+    assert not gradient.any()
+
+
+@pytest.mark.parametrize("translation", [[5.0, 0, 0.6], [0, 0, -0.6], [0.12, 0, 0.6], [0, 0, 0.02]])
+@pytest.mark.parametrize("function", [render, render_reference])
+def test_off_screen_clipped_and_behind_the_camera(function: type(render), translation: list[float]) -> None:
+    model = objects.build("cup")
+    R, _, K = _views(model, 1, seed=5)
+    pose = R.requires_grad_(), torch.tensor([translation]).requires_grad_()
+    o = function(RenderMesh.from_mesh(model.mesh), *pose, K, SIZE, SIZE)
+    total = o.mask.sum() + o.normals.square().sum() + o.depth.sum() + o.nocs.sum()
+    total.backward()
+    for value in (total, pose[0].grad, pose[1].grad):
+        assert value is not None
+        assert torch.isfinite(value).all()
+    if abs(translation[0]) > 1 or translation[2] < 0:
+        assert not o.mask.any()
+        assert pose[1].grad is not None
+        assert not pose[1].grad.any()
+
+
+def test_a_batch_is_its_images_and_autocast_stays_in_float32() -> None:
+    model = objects.build("fork")
+    mesh = RenderMesh.from_mesh(model.mesh)
+    R, t, K = _views(model, 3, seed=6)
+    batch = render(mesh, R, t, K, SIZE, SIZE)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        single = render(mesh, R[1:2], t[1:2], K[1:2], SIZE, SIZE)
+    assert single.normals.dtype == torch.float32
+    torch.testing.assert_close(single.nocs[0], batch.nocs[1])
+    torch.testing.assert_close(single.normals[0], batch.normals[1])

@@ -6,8 +6,8 @@ visible one has negative z at the image centre. Angles of polarization are count
 takes the viewing ray onto the optical axis. In it theta is the angle between normal and viewer, and
 phi = atan2(-m_y, m_x) the azimuth of the normal m; light reflected specularly is polarized along
 phi + 90 deg, light that comes out of the body (diffuse) along phi (the paper's equation of the angle of
-polarization). The paper treats only theta per ray; the azimuth per ray is our choice. It makes the model exact
-under rotations about the optical axis.
+polarization). The paper treats only theta per ray; the azimuth per ray is our choice. It makes the model
+exact under rotations about the optical axis.
 
 Functions of `cos_theta` use arithmetic only and take tensors, arrays or floats alike.
 """
@@ -165,16 +165,19 @@ def analytic_dolp(normals: Tensor, rays: Tensor, index: float) -> tuple[Tensor, 
         normals, rays: (B, 3, H, W).
         index: refractive index.
 
-    Differentiable, and finite with finite gradients at 0 and 90 deg (the paper's equation of the analytical DoP).
+    Differentiable, and finite with finite gradients at 0 and 90 deg (the paper's equation of the analytical
+    DoP).
     """
     cosine = cos_incidence(normals, rays)
     return rho_diffuse(cosine, index), rho_specular(cosine, index)
 
 
 def doubled_azimuth(normals: Tensor, rays: Tensor) -> Tensor:
-    """(cos 2 phi, sin 2 phi) of normals, (B, 2, H, W): the direction of (S1, S2) in diffuse light, and minus
-    that in specular light. Tends to zero, with finite gradients, where the normal faces the viewer and phi
-    is undefined."""
+    """(cos 2 phi, sin 2 phi) of normals, (B, 2, H, W): the direction of (S1, S2) in diffuse light.
+
+    In specular light (S1, S2) points the opposite way. Tends to zero, with finite gradients, where the normal
+    faces the viewer and phi is undefined.
+    """
     x, y, _ = to_ray_frame(normals, rays).unbind(1)
     inclined = x * x + y * y + 1e-8
     return torch.stack([(x * x - y * y) / inclined, -2 * x * y / inclined], dim=1)

@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from acquisition.camera import Camera
+from acquisition.clocks import FEWEST_SAMPLES, fit_clock
 from dataset.errors import ToolkitError
 from dataset.frames import RawFrame
 from dataset.session import Chunk, SessionWriter, compress
@@ -35,8 +36,8 @@ class FrameLedger:
     def __init__(self, writer: SessionWriter) -> None:
         self.stored = 0
         self.dropped = 0
-        self.camera_time_ns: list[int] = []
-        self.host_time_ns: list[int] = []
+        self._camera_time_ns: list[int] = []
+        self._host_time_ns: list[int] = []
         self._writer = writer
         self._last_id: int | None = None
 
@@ -44,9 +45,9 @@ class FrameLedger:
         """Stores the frame, and ledgers those between it and the one before."""
         self._arrived(frame.frame_id, frame.host_time_ns)
         self._writer.add_frame(frame, chunk)
+        self._camera_time_ns.append(frame.camera_time_ns)
+        self._host_time_ns.append(frame.host_time_ns)
         self.stored += 1
-        self.camera_time_ns.append(frame.camera_time_ns)
-        self.host_time_ns.append(frame.host_time_ns)
 
     def drop(self, frame_id: int, reason: str, host_time_ns: int) -> None:
         """Ledgers a frame that arrived and is not stored, and those between it and the one before."""
@@ -56,6 +57,16 @@ class FrameLedger:
     def never_came(self, reason: str, host_time_ns: int) -> None:
         """Ledgers a frame that was asked for, whose number nobody knows."""
         self._enter(UNKNOWN_FRAME_ID, reason, host_time_ns)
+
+    def store_clock(self) -> None:
+        """Stores the camera's clock as the frames so far show it; a handful of stills cannot, and needs none.
+
+        Raises ToolkitError where the camera's clock jumped.
+        """
+        count = self.stored  # another thread may be storing
+        if count >= FEWEST_SAMPLES:
+            fit = fit_clock(self._camera_time_ns[:count], self._host_time_ns[:count])
+            self._writer.set_clocks(camera=fit)
 
     def _arrived(self, frame_id: int, host_time_ns: int) -> None:
         first_missing = frame_id if self._last_id is None else self._last_id + 1

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from acquisition.camera import Camera, Trigger
-from acquisition.clocks import FEWEST_SAMPLES, fit_clock
 from acquisition.frame_stream import FrameLedger, FrameStream
 from acquisition.robot import MotionStopped, PoseSource, Robot
 from acquisition.trace_log import TraceLog
@@ -188,16 +187,10 @@ def _recording(
             with contextlib.suppress(ToolkitError):
                 camera.stop()
             with contextlib.suppress(ToolkitError):
-                _store_camera_clock(ledger, writer)
+                ledger.store_clock()
             raise
         camera.stop()
-        _store_camera_clock(ledger, writer)
-
-
-def _store_camera_clock(ledger: FrameLedger, writer: SessionWriter) -> None:
-    # A handful of stills at rest needs no clock, and cannot give one.
-    if ledger.stored >= FEWEST_SAMPLES:
-        writer.set_clocks(camera=fit_clock(ledger.camera_time_ns, ledger.host_time_ns))
+        ledger.store_clock()
 
 
 def _triggered_frame(camera: Camera, ledger: FrameLedger) -> RawFrame:
@@ -238,6 +231,7 @@ class _Supervisor:
         self._on_progress = on_progress
         self._moving = threading.Event()
         self._ended = threading.Event()
+        self._fit_clocks_after_s = 1.0
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="supervise")
 
@@ -282,6 +276,11 @@ class _Supervisor:
 
     def _tick(self, elapsed_s: float) -> None:
         self._log.flush()
+        if elapsed_s > self._fit_clocks_after_s:
+            # For a recording that will be killed; ever more rarely, since a fit costs more and gains less.
+            self._fit_clocks_after_s = 1.5 * elapsed_s
+            self._ledger.store_clock()
+            self._log.store_clock()
         done = None if self._duration_s is None else min(1.0, elapsed_s / self._duration_s)
         self._on_progress(Progress(self._ledger.stored, self._ledger.dropped, done))
         if done == 1.0 or self._stream.failed.is_set():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from acquisition.clocks import fit_clock
+from acquisition.clocks import FEWEST_SAMPLES, fit_clock
 from acquisition.robot import PoseSource
 from dataset.errors import ToolkitError
 from dataset.frames import RobotTrace
@@ -66,10 +66,17 @@ class TraceLog:
         self._source.sample()  # raises where no more will come
         return trace
 
+    def store_clock(self) -> None:
+        """Stores the arm's clock as the samples so far show it. Raises ToolkitError where it jumped."""
+        with self._lock:
+            robot_s, host_ns = self._robot_time_s.copy(), self._host_time_ns.copy()
+        if sum(map(len, robot_s)) >= FEWEST_SAMPLES:
+            robot_ns = np.rint(1e9 * np.concatenate(robot_s)).astype(np.int64)
+            self._writer.set_clocks(robot=fit_clock(robot_ns, np.concatenate(host_ns)))
+
     def _finish(self, source: PoseSource) -> None:
         self._store(source, source.stop_trace)
-        robot_ns = np.rint(1e9 * np.concatenate(self._robot_time_s)).astype(np.int64)
-        self._writer.set_clocks(robot=fit_clock(robot_ns, np.concatenate(self._host_time_ns)))
+        self.store_clock()
 
     def _store(self, source: PoseSource, take: Callable[[], RobotTrace]) -> RobotTrace:
         with self._lock:  # two threads that take and store in turns would mix the order

@@ -14,16 +14,18 @@ import json
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acquisition.simulation.fake_device import Exposure, FakeDevice
-from acquisition.simulation.patterns import FrameSource
 from acquisition.simulation.process import SimulatorProcess, die_with_parent, serve_commands
 from dataset.errors import ToolkitError
 from dataset.pixel_formats import pack, pixel_format
+
+if TYPE_CHECKING:
+    from acquisition.simulation.patterns import FrameSource
 
 DEFAULT_SOURCE = "acquisition.simulation.patterns:MovingPattern"
 

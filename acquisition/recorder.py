@@ -117,7 +117,7 @@ def record_stream(
         writer: of the session, with `camera.info`.
         motion: moves the arm, such as `lambda: robot.follow(path)`; the recording ends when it returns.
         duration_s: the recording ends after this long, and stops a motion that is still under way.
-        on_progress: called ten times a second, from another thread.
+        on_progress: called ten times a second from another thread, and at the end.
 
     Raises:
         ToolkitError: neither motion nor duration is given.
@@ -135,7 +135,9 @@ def record_stream(
             supervisor.over.wait()
         else:
             supervisor.run(motion)
-    return Progress(ledger.stored, ledger.dropped, 1.0)
+    progress = Progress(ledger.stored, ledger.dropped, 1.0)
+    on_progress(progress)
+    return progress
 
 
 def record_touches(
@@ -279,8 +281,9 @@ class _Supervisor:
         if elapsed_s > self._fit_clocks_after_s:
             # For a recording that will be killed; ever more rarely, since a fit costs more and gains less.
             self._fit_clocks_after_s = 1.5 * elapsed_s
-            self._ledger.store_clock()
-            self._log.store_clock()
+            with contextlib.suppress(ToolkitError):  # what is wrong with a clock is said at the end
+                self._ledger.store_clock()
+                self._log.store_clock()
         done = None if self._duration_s is None else min(1.0, elapsed_s / self._duration_s)
         self._on_progress(Progress(self._ledger.stored, self._ledger.dropped, done))
         if done == 1.0 or self._stream.failed.is_set():

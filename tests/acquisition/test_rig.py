@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from acquisition.rig import EXAMPLE, BoardTable, CameraTable, FramesTable, Rig, RobotTable
-from dataset.errors import ToolkitError
+from acquisition.camera import Camera
+from acquisition.rig import (
+    EXAMPLE,
+    BoardTable,
+    CameraTable,
+    FramesTable,
+    Rig,
+    RobotTable,
+    open_camera,
+    open_pose_source,
+    open_robot,
+)
+from acquisition.robot import PoseSource
+from dataset.errors import DeviceError, ToolkitError
 
 MINIMAL = """
 [camera]
@@ -91,3 +104,13 @@ def test_mistakes_are_named(tmp_path: Path, text: str, parts: list[str]) -> None
 def test_missing_file_points_to_the_example(tmp_path: Path) -> None:
     with pytest.raises(ToolkitError, match=r"no-rig\.toml: no such file; copy .*rig\.example\.toml"):
         Rig.load(tmp_path / "no-rig.toml")
+
+
+@pytest.mark.parametrize("open_device", [open_camera, open_robot, open_pose_source])
+def test_a_device_that_does_not_answer_is_named_with_what_to_check(
+    open_device: Callable[[Rig], Camera | PoseSource],
+) -> None:
+    address = "127.0.0.51"
+    robot = RobotTable(address, tcp_offset=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    with pytest.raises(DeviceError, match=f"{address}.*check"):
+        open_device(Rig(CameraTable(address), robot))

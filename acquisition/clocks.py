@@ -1,8 +1,8 @@
 """Relating a device's clock to the host's from nothing but arrival times.
 
 A sample can reach the host late, never early, so the truth lies along the lower envelope of host time against
-device time. The constant part of the latency cannot be told from an offset between the clocks; it is estimated
-from motion instead.
+device time. The constant part of the latency cannot be told from an offset between the clocks; it is
+estimated from motion instead.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ _SAMPLES_PER_WINDOW = 4  # and longer ones for single pictures, of which each ca
 FEWEST_SAMPLES = 5
 _CRYSTAL_PPM = 50.0  # our choice: how far a device's rate is expected from the host's before the data speak
 _LARGEST_RATE_ERROR = 0.01  # beyond it the times are in another unit
+_LARGEST_SPAN_RATIO = 3.0  # of the whole capture on both clocks; late arrivals stretch a short one
 _ROUNDS = 30
-_TUKEY = 4.0  # scatters from the line at which a window's earliest sample counts as late and is ignored
+_TUKEY = 4.0  # scatters from the line at which a window's earliest sample is ignored as late
 
 
 def fit_clock(device_ns: ArrayLike, host_ns: ArrayLike) -> ClockFit:
     """The line host = a + b * device along the lower envelope of the arrivals.
 
-    The earliest arrival of each second, then a robust line through those; the rate is drawn towards 1 with the
-    accuracy of a crystal, which only shows where the capture lasts a few seconds.
+    The earliest arrival of each second, then a robust line through those; the rate is drawn towards 1 with
+    the accuracy of a crystal, which only shows where the capture lasts a few seconds.
 
     Args:
         device_ns: (N,) times on the device's clock, nanoseconds, strictly increasing.
@@ -46,20 +47,27 @@ def fit_clock(device_ns: ArrayLike, host_ns: ArrayLike) -> ClockFit:
     device, host = np.asarray(device_ns, dtype=np.int64), np.asarray(host_ns, dtype=np.int64)
     _check(device, host)
     elapsed = (device - device[0]) * 1e-9
+    span_ratio = float(host[-1] - host[0]) / float(device[-1] - device[0])
+    if not 1 / _LARGEST_SPAN_RATIO < span_ratio < _LARGEST_SPAN_RATIO:
+        raise _other_unit(span_ratio)
     lateness = ((host - host[0]) - (device - device[0])).astype(np.float64)  # ns; small, so exact as a float
     times, earliest = _window_minima(elapsed, lateness)
     centre, slope, scatter = _robust_line(times, earliest)
     if abs(slope) > _LARGEST_RATE_ERROR * 1e9:
-        raise ToolkitError(
-            f"the device's clock runs {1 + slope * 1e-9:.3f} times as fast as the host's; its times are not in "
-            "nanoseconds, or its clock was set during the recording: record again"
-        )
+        raise _other_unit(1 + slope * 1e-9)
     b = 1.0 + slope * 1e-9
     # host = host[0] + (device - device[0]) + centre + slope * (elapsed - mean), gathered by powers of device.
     middle = float(times.mean())
     offset_ns = int(host[0]) - int(device[0])
     a_ns = offset_ns + centre - slope * (middle + int(device[0]) * 1e-9)
     return ClockFit(a_ns=float(a_ns), b=b, sigma_ns=scatter)
+
+
+def _other_unit(ratio: float) -> ToolkitError:
+    return ToolkitError(
+        f"fit_clock: {ratio:.4g} s pass on the host's clock in a second of the device's; its times are not "
+        "in nanoseconds, or its clock was set during the recording: record again"
+    )
 
 
 def _check(device: NDArray[np.int64], host: NDArray[np.int64]) -> None:
@@ -74,8 +82,8 @@ def _check(device: NDArray[np.int64], host: NDArray[np.int64]) -> None:
         if step.min() < allowed:
             index = int(np.argmax(step < allowed)) + 1
             raise ToolkitError(
-                f"fit_clock: the {name} time goes from {times[index - 1]} to {times[index]} ns at sample {index}; "
-                "the device restarted or its clock was set: use only the samples before or after"
+                f"fit_clock: the {name} time goes from {times[index - 1]} to {times[index]} ns at sample "
+                f"{index}: the device restarted or its clock was set: use only the samples before or after"
             )
 
 

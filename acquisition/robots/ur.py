@@ -24,7 +24,8 @@ from dataset.transforms import SE3, rotation_error_deg
 Floats = NDArray[np.float64]
 
 _POLL_S = 0.02
-_ARRIVED_RAD = 0.01
+_ARRIVED, _NEARLY_ARRIVED = 0.0005, 0.01  # rad or m; a loaded arm settles in between
+_ARRIVAL_SHOWS_WITHIN_S = 1.0
 _PLAUSIBLE_M, _PLAUSIBLE_DEG = 0.02, 3.0  # factory calibration differs from the nominal arm by millimetres
 _TCP_SHOWS_WITHIN_S = 1.0  # a tool offset that was set reaches the stream some packages later
 _PATH_STEP_RAD = 0.05  # between the points of a joint path that are checked against the workspace
@@ -204,7 +205,7 @@ class UrRobot(Robot):
                     if self._stop_requested.is_set():
                         self._motion.ask("stop", deceleration=_STOP_DECELERATION)
                         raise MotionStopped(
-                            f"the arm {self.config.host} was told to stop on its way; command it anew to go on"
+                            f"the arm {self.config.host} was told to stop on its way; command it again to"
                         )
                     time.sleep(_POLL_S)
             except (KeyboardInterrupt, SystemExit):
@@ -213,13 +214,17 @@ class UrRobot(Robot):
         self._check_arrived(target, verb)
 
     def _check_arrived(self, target: Floats | SE3, verb: str) -> None:
-        self._stream.check()
-        now = self._stream.sample()
-        if isinstance(target, SE3):
-            away = float(np.linalg.norm(now.T_base_tcp.translation - target.translation))
-        else:
-            away = float(np.abs(now.q - target).max())
-        if away > _ARRIVED_RAD:
+        # The stream can lag behind the motion process, and then still shows the last centimetre of the way.
+        deadline = time.monotonic() + _ARRIVAL_SHOWS_WITHIN_S
+        while True:
+            self._stream.check()
+            away = _distance(self._stream.sample(), target)
+            if away < _ARRIVED:
+                return
+            if time.monotonic() > deadline:
+                break
+            time.sleep(_POLL_S)
+        if away > _NEARLY_ARRIVED:
             raise DeviceError(
                 f"the arm {self.config.host} ended {verb.replace('_', ' ')} {away:.3f} m or rad before its "
                 "target; check the pendant for a message, or whether another program commands the arm"
@@ -276,6 +281,12 @@ class UrRobot(Robot):
     def _inside(self, positions: Floats) -> NDArray[np.bool_]:
         low, high = (np.array(corner) for corner in self.config.workspace)
         return np.asarray(((positions >= low) & (positions <= high)).all(axis=1))
+
+
+def _distance(sample: RobotSample, target: Floats | SE3) -> float:
+    if isinstance(target, SE3):
+        return float(np.linalg.norm(sample.T_base_tcp.translation - target.translation))
+    return float(np.abs(sample.q - target).max())
 
 
 def _joints(q: ArrayLike, shape: tuple[int, ...]) -> Floats:

@@ -94,7 +94,7 @@ class Stopping:
 
 @dataclass
 class JointSpeed:
-    """Approaches joint rates `target` (6,), rad/s, at `acceleration`; ends after `duration_s` > 0."""
+    """Approaches joint rates `target` (6,), rad/s, at `acceleration`; ends after `duration_s`."""
 
     target: Floats
     acceleration: float
@@ -104,13 +104,12 @@ class JointSpeed:
         """See `Motion`."""
         new = qd + np.clip(self.target - qd, -self.acceleration * dt, self.acceleration * dt)
         self.duration_s -= dt
-        ended = -dt <= self.duration_s < 0
-        return q + 0.5 * dt * (qd + new), new, ended
+        return q + 0.5 * dt * (qd + new), new, self.duration_s <= 0
 
 
 @dataclass
 class ToolSpeed:
-    """Moves the flange with a twist (6,) [m/s, rad/s] in the base frame; ends after `duration_s` > 0."""
+    """Moves the flange with a twist (6,) [m/s, rad/s] in the base frame; ends after `duration_s`."""
 
     twist: Floats
     acceleration: float

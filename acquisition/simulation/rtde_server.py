@@ -111,7 +111,7 @@ class _Client:
         self._names: list[str] = []
         self._layout = struct.Struct(">B")
         self._frequency = 0.0
-        self._credit = 1.0
+        self._credit = 0.0
         self._inputs: list[list[tuple[str, struct.Struct]]] = []
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._backlog = bytearray()

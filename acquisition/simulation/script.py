@@ -7,6 +7,7 @@ those of the program in ur_rtde 1.6. It may be asked to use the upper half of th
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 
@@ -194,11 +195,11 @@ class ControlScript:
         return True
 
     def _speed_joints(self) -> bool:
-        self._arm.begin(JointSpeed(self._doubles(0), self._double(6), self._double(7)))
+        self._arm.begin(JointSpeed(self._doubles(0), self._double(6), self._double(7) or math.inf))
         return False
 
     def _speed_tool(self) -> bool:
-        self._arm.begin(ToolSpeed(self._doubles(0), self._double(6), self._double(7)))
+        self._arm.begin(ToolSpeed(self._doubles(0), self._double(6), self._double(7) or math.inf))
         return False
 
     def _servo_joints(self) -> bool:

@@ -178,6 +178,15 @@ def build(name: str) -> ObjectModel:
     )
 
 
+def named_object(name: str, mesh: str | Path | None = None) -> ObjectModel:
+    """A built-in object, or, given a mesh file, an object of that name loaded from it.
+
+    Raises:
+        ToolkitError: see `build` and `load`.
+    """
+    return build(name) if mesh is None else load(mesh, name=name)
+
+
 def load(
     path: str | Path,
     *,

@@ -1,0 +1,1 @@
+"""Training sets: rendered polarization images with exact poses, masks and boxes."""

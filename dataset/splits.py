@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dataset.errors import ToolkitError
+from dataset.errors import SessionError, ToolkitError
+from dataset.session import Session, write_split
 from dataset.transforms import SE3
 
 Indices = NDArray[np.int64]
@@ -79,6 +82,34 @@ def by_view(
         taken = np.concatenate([taken, views[mine]])
     hint = f"{len(known)} posed frames cover too few directions"
     return _not_empty({name: found[name] for name in fractions}, fractions, hint)
+
+
+def split_session(
+    path: str | Path, by: Literal["frame", "view"], train: float, val: float, seed: int
+) -> dict[str, Indices]:
+    """Divides a session into train, val and test (the rest), and stores the split in the file.
+
+    Args:
+        path: of a complete session; annotated with one object at least where `by` is "view".
+        by: see `by_frame` and `by_view`.
+        train, val: shares of the frames.
+        seed: same seed, same split.
+
+    Raises:
+        ToolkitError: as `by_frame` and `by_view`.
+        SessionError: the session cannot be read or edited, or lacks the poses that views need.
+    """
+    fractions = {"train": train, "val": val, "test": 1.0 - train - val}
+    with Session.open(path) as session:
+        if by == "frame":
+            found = by_frame(len(session), fractions, seed)
+        elif not session.objects:
+            raise SessionError(f"{path} has no annotated object, so no views; run: s2p3 annotate {path}")
+        else:
+            found = by_view(session.object_poses(session.objects[0]).T_cam_obj, fractions, seed)
+    for name, indices in found.items():
+        write_split(path, name, indices)
+    return found
 
 
 def _deal_cells(cells: Indices, fractions: Mapping[str, float], rng: np.random.Generator) -> NDArray[np.str_]:

@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
 from dataset import SE3, ToolkitError
+from dataset.session import ObjectRecord
 from s2p3 import object_meshes
 from s2p3.rendering.mesh import Mesh
 
@@ -107,6 +108,19 @@ class ObjectModel:
     def mesh(self) -> Mesh:
         """The same mesh prepared for rendering."""
         return Mesh.from_arrays(self.vertices, self.faces)
+
+    def to_record(self) -> ObjectRecord:
+        """As a session stores it."""
+        return ObjectRecord(
+            self.name,
+            self.vertices,
+            self.faces,
+            self.material,
+            self.refractive_index,
+            self.extinction,
+            self.symmetry.to_json(),
+            self.diameter,
+        )
 
     @property
     def resting(self) -> SE3:

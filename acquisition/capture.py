@@ -1,0 +1,138 @@
+"""What a lab records, from a rig file: the board, the object, touched points. Plans the motion and runs the recorder.
+
+Each capture opens the rig's devices, plans from the rig's guesses, records one session and closes the devices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import cycle
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acquisition.camera import Camera
+from acquisition.planning import CarriedCamera, plan_path, plan_stills
+from acquisition.recorder import NO_CAMERA, OnProgress, Progress, record_stills, record_stream, record_touches
+from acquisition.rig import Rig, open_camera, open_pose_source, open_robot
+from acquisition.robot import Robot
+from acquisition.trajectories import hand_eye_views, hemisphere_path
+from dataset.frames import CameraInfo
+from dataset.intrinsics import Intrinsics
+from dataset.session import SessionWriter
+from dataset.transforms import SE3
+
+Floats = NDArray[np.float64]
+
+_CANDIDATE_VIEWS = 80
+_NOMINAL_FOCAL = 0.71
+"""Focal length in image widths, for planning only (our choice: the paper's 6 mm lens on a 2/3 inch sensor)."""
+_RADII_M = (0.38, 0.31, 0.45)
+"""Distances from which the object is filmed, one sweep after the other (our choice)."""
+_ELEVATIONS_DEG = (30.0, 80.0)
+_BOARD_SWEEP_VIEWS = 10
+
+
+def capture_board(
+    rig: Rig,
+    out: Path,
+    *,
+    kind: Literal["intrinsics", "hand_eye"] = "hand_eye",
+    views: int = 24,
+    seed: int = 0,
+    on_progress: OnProgress = lambda progress: None,
+) -> Progress:
+    """Stills of the calibration board from diverse directions; serves intrinsics and hand-eye calibration.
+
+    Args:
+        out: session file to write.
+        views: how many; fewer where the arm does not reach so many.
+        seed: of the choice of views.
+
+    Raises:
+        ToolkitError: no view is reachable.
+        DeviceError: a device does not answer or stopped.
+    """
+    with _devices(rig) as (camera, robot), _writer(out, kind, camera.info, rig) as writer:
+        plan = plan_stills(_board_views(rig, camera.info, seed), _carried(rig, robot), robot.sample().q, views)
+        return record_stills(camera, robot, plan.q, writer, on_progress=on_progress)
+
+
+def capture_board_motion(
+    rig: Rig, out: Path, *, seconds: float, seed: int = 1, on_progress: OnProgress = lambda progress: None
+) -> Progress:
+    """The board filmed while the arm moves: what the clock offset between camera and arm is estimated from."""
+    with _devices(rig) as (camera, robot), _writer(out, "hand_eye", camera.info, rig) as writer:
+        views = _board_views(rig, camera.info, seed)
+        plan = plan_stills(views, _carried(rig, robot), robot.sample().q, _BOARD_SWEEP_VIEWS)
+        robot.move_joints(plan.q[0])
+        sweep = _to_and_fro(robot, [plan.q])
+        return record_stream(camera, robot, writer, motion=sweep, duration_s=seconds, on_progress=on_progress)
+
+
+def capture_sequence(
+    rig: Rig, out: Path, *, seconds: float, on_progress: OnProgress = lambda progress: None
+) -> Progress:
+    """The object filmed from the hemisphere above it, sweep after sweep at changing distance."""
+    with _devices(rig) as (camera, robot), _writer(out, "sequence", camera.info, rig) as writer:
+        centre = np.array(rig.frames.object_centre_guess)
+        carried = _carried(rig, robot)
+        q = robot.sample().q
+        sweeps = []
+        for radius in _RADII_M:
+            path = plan_path(hemisphere_path(centre, (radius, radius), _ELEVATIONS_DEG), carried, q)
+            sweeps.append(path.q)
+            q = path.q[-1]
+        robot.move_joints(sweeps[0][0])
+        motion = _to_and_fro(robot, sweeps)
+        return record_stream(camera, robot, writer, motion=motion, duration_s=seconds, on_progress=on_progress)
+
+
+def capture_touches(
+    rig: Rig, out: Path, *, count: int, on_progress: OnProgress = lambda progress: None
+) -> Progress:
+    """Points touched with the measuring tip while the arm is guided by hand; the toolkit only reads the arm."""
+    with open_pose_source(rig) as source, _writer(out, "tool_tip", NO_CAMERA, rig) as writer:
+        touches = record_touches(source, writer, count, on_progress=on_progress)
+    return Progress(len(touches), 0, 1.0)
+
+
+@contextmanager
+def _devices(rig: Rig) -> Iterator[tuple[Camera, Robot]]:
+    with open_camera(rig) as camera, open_robot(rig) as robot:
+        yield camera, robot
+
+
+def _writer(
+    out: Path, kind: Literal["intrinsics", "hand_eye", "tool_tip", "sequence"], camera: CameraInfo, rig: Rig
+) -> SessionWriter:
+    return SessionWriter(out, kind, camera, rig_toml=rig.to_toml())
+
+
+def _carried(rig: Rig, robot: Robot) -> CarriedCamera:
+    return CarriedCamera(
+        SE3.from_pose6(robot.tcp_offset), SE3.from_pose6(np.array(rig.frames.T_tcp_cam_guess))
+    )
+
+
+def _board_views(rig: Rig, camera: CameraInfo, seed: int) -> SE3:
+    focal = _NOMINAL_FOCAL * camera.width
+    matrix = np.array([[focal, 0, (camera.width - 1) / 2], [0, focal, (camera.height - 1) / 2], [0, 0, 1]])
+    rough = Intrinsics(matrix, np.zeros(0), camera.height, camera.width)
+    board = rig.board
+    size = (board.squares_x * board.square_m, board.squares_y * board.square_m)
+    pose = SE3.from_pose6(np.array(rig.frames.T_base_board_guess))
+    return hand_eye_views(pose, size, rough, _CANDIDATE_VIEWS, seed)
+
+
+def _to_and_fro(robot: Robot, paths: list[Floats]) -> Callable[[], None]:
+    """A motion without an end: along each path, from wherever the one before it ended."""
+
+    def move() -> None:
+        for path in cycle([*paths, *[p[::-1] for p in reversed(paths)]]):
+            robot.follow(path)
+
+    return move

@@ -1,0 +1,87 @@
+"""Annotates a recorded session: where the camera was and where the object is, in every frame, without a human's click.
+
+T_cam_obj = T_base_cam^-1 T_base_obj: the arm's forward kinematics at the exposure, the hand-eye transform, and the pose
+at which the object was touched. Masks and boxes are rendered from it, in the undistorted image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibration import Calibration, camera_poses
+from dataset import SE3, CalibrationError, Intrinsics
+from dataset.session import ObjectPoses, Session, write_calibration, write_object, write_poses
+from dataset.validate import mask_box
+from s2p3.objects import ObjectModel
+from s2p3.rendering.rasterizer import projected_region, rasterize
+
+Progress = Callable[[int, int], None]
+"""Called with (frames done, frames in all)."""
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """What was written: frames in all, and those in which the object is in view."""
+
+    frames: int
+    visible: int
+
+
+def annotate(path: Path, calibration: Calibration, model: ObjectModel, on_progress: Progress | None = None) -> Annotation:
+    """Writes camera poses, object poses, boxes and masks into a session, replacing earlier ones.
+
+    Args:
+        path: of a complete session with a robot trace.
+        calibration: with intrinsics, hand-eye and the object's pose; the time offset where the arm was moving.
+        model: the object.
+
+    Raises:
+        CalibrationError: a part is missing, or the object's pose was not calibrated.
+        SessionError: the session cannot be read or edited.
+    """
+    calibration.require("intrinsics", "hand_eye")
+    assert calibration.intrinsics is not None
+    if model.name not in calibration.objects:
+        known = ", ".join(calibration.objects) or "none"
+        raise CalibrationError(
+            f"calibration: no pose of {model.name!r} (objects: {known}); touch it and run `s2p3 calibrate object` first"
+        )
+    write_calibration(path, calibration.to_json(), calibration.intrinsics.intrinsics)
+    write_object(path, model.to_record())
+    with Session.open(path) as session:
+        cameras = camera_poses(session, calibration)
+        poses = render_poses(session, cameras.T_base_cam.inverse() @ calibration.objects[model.name].T_base_obj, model, on_progress)
+    write_poses(path, cameras.T_base_cam, cameras.sigma_m, cameras.sigma_rad, {model.name: poses})
+    return Annotation(len(poses.visible_fraction), int((poses.visible_fraction > 0).sum()))
+
+
+def render_poses(session: Session, T_cam_obj: SE3, model: ObjectModel, on_progress: Progress | None = None) -> ObjectPoses:
+    """Masks, boxes and visibility of an object at known poses (N) in a session's undistorted image.
+
+    The visible fraction is the share of the silhouette inside the image; what occludes the object is not known.
+    """
+    camera = session.working_intrinsics
+    height, width = camera.height, camera.width
+    # Drawn on a canvas with the image in its middle: what falls outside the image counts for visibility.
+    shift = np.array([[0, 0, width], [0, 0, height], [0, 0, 0]])
+    canvas = Intrinsics(camera.K + shift, camera.distortion, 3 * height, 3 * width)
+    count = len(session)
+    masks = np.zeros((count, height, width), dtype=bool)
+    boxes = np.zeros((count, 4))
+    visible = np.zeros(count)
+    for index in range(count):
+        if np.isfinite(T_cam_obj.translation[index]).all():
+            pose = T_cam_obj[index]
+            raster = rasterize(model.mesh, pose, canvas, projected_region(model.mesh, pose, canvas))
+            drawn = np.zeros((3 * height, 3 * width), dtype=bool)
+            drawn[raster.window] = raster.mask
+            masks[index] = drawn[height : 2 * height, width : 2 * width]
+            boxes[index] = mask_box(masks[index])
+            visible[index] = masks[index].sum() / max(raster.mask.sum(), 1)
+        if on_progress is not None:
+            on_progress(index + 1, count)
+    return ObjectPoses(T_cam_obj, visible, boxes, masks)

@@ -1,0 +1,57 @@
+"""`s2p3 doctor` and `s2p3 simulate`."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+from s2p3.commands.output import console, show
+
+
+def doctor(*, rig: Path | None = None, json: bool = False) -> None:
+    """Check what is installed, which device answers, the disk; each failing line says the fix.
+
+    Args:
+        rig: rig.toml of the devices to check; without it, only this machine is.
+        json: print the checks as JSON.
+    """
+    from acquisition.rig import Rig
+    from dataset.errors import ToolkitError
+    from s2p3.doctor import doctor as run_checks
+
+    checks = run_checks(None if rig is None else Rig.load(rig))
+    if json:
+        show({check.name: {"ok": check.ok, "detail": check.detail, "fix": check.fix} for check in checks}, as_json=True)
+    else:
+        for check in checks:
+            mark = "[green]ok  [/green]" if check.ok else "[red]FAIL[/red]"
+            console.print(f"{mark} {check.name}: {check.detail}" + ("" if check.ok else f"  [bold]Fix:[/bold] {check.fix}"))
+    failed = [check.name for check in checks if not check.ok]
+    if failed:
+        raise ToolkitError(f"doctor: {len(failed)} of {len(checks)} checks failed ({', '.join(failed)}); each line above says the fix")
+
+
+def simulate(
+    *,
+    rig: Path | None = None,
+    lab: Path = Path("out/lab"),
+    object: str = "cup",
+    seed: int = 0,
+) -> None:
+    """Serve the simulated camera (GigE Vision) and arm (RTDE) until Ctrl-C, for any client.
+
+    Args:
+        rig: rig.toml whose addresses to serve at; without it one is written into the lab's folder.
+        lab: folder of the lab: its rig.toml, and truth.json, which nobody should peek at.
+        object: what lies on the table: cup, fork, knife or bottle.
+        seed: which lab; the same seed gives the same hidden truth.
+    """
+    from acquisition.rig import Rig
+    from s2p3.lab import found_lab, running_lab
+
+    truth, rig_path = found_lab(lab, object, seed)
+    devices = Rig.load(rig or rig_path)
+    with running_lab(truth, devices):
+        console.print(f"camera PHX050S-Q at {devices.camera.address} (GigE Vision), UR5e at {devices.robot.host} (RTDE)")
+        console.print(f"try:  arv-tool-0.8    s2p3 doctor --rig {rig or rig_path}    Ctrl-C ends both")
+        threading.Event().wait()

@@ -1,0 +1,54 @@
+"""How verbs show progress and print results."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+console = Console(stderr=True, highlight=False)
+"""For people. Results that a script would read go to stdout."""
+
+
+@contextmanager
+def counting(label: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar with an ETA; call the yielded function with (done, in all)."""
+    with counting_many((label,)) as report:
+        yield lambda done, total: report(label, done, total)
+
+
+@contextmanager
+def counting_many(labels: Iterable[str]) -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar with an ETA for each label; call the yielded function with (label, done, in all)."""
+    columns = (TextColumn("  {task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bar:
+        tasks = {label: bar.add_task(label, total=None) for label in labels}
+
+        def report(label: str, done: int, total: int) -> None:
+            bar.update(tasks[label], completed=done, total=total)
+
+        yield report
+
+
+def show(values: Mapping[str, Any], as_json: bool) -> None:
+    """Prints one result: JSON for a script, aligned lines for a person."""
+    if as_json:
+        print(json.dumps(values, indent=1, default=str))
+        return
+    width = max((len(name) for name in values), default=0)
+    for name, value in values.items():
+        print(f"{name:<{width}}  {_readable(value)}")
+
+
+def _readable(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_readable(item)}" for name, item in value.items()) or "none"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_readable(item) for item in value) or "none"
+    return str(value)

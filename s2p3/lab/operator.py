@@ -1,0 +1,133 @@
+"""The person in the simulated lab who guides the arm by hand and touches the object with the measuring tip.
+
+A process of its own: it knows where the object is, as eyes do; the toolkit only reads the arm meanwhile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acquisition.rig import Rig
+from acquisition.robots.ur import UrRobot
+from acquisition.simulation.process import SimulatorProcess, die_with_parent, serve_commands
+from dataset.transforms import SE3
+from s2p3 import objects
+from s2p3.lab.truth import LabTruth
+
+_HOLD_S = 0.75
+"""How long the tip rests on a point; the recorder wants 0.6 s."""
+_RETREAT_M = 0.04
+_CLEARANCE_M = 0.012
+"""Points lower above the table than this are not touched: the tip has a body."""
+
+
+class Operator(SimulatorProcess):
+    """Starts the operator; from then on touches point after point until it has touched `count`."""
+
+    def __init__(self, truth_path: Path, rig_path: Path, count: int) -> None:
+        arguments = ("--truth", str(truth_path), "--rig", str(rig_path), "--count", str(count))
+        super().__init__("s2p3.lab.operator", arguments, ready_timeout_s=60.0)
+        self._count = count
+
+    @contextmanager
+    def touching(self) -> Iterator[None]:
+        """Touches in the background for the length of the `with` block, at whose end a failure is raised.
+
+        Raises:
+            DeviceError: the operator could not reach a point.
+        """
+        with ThreadPoolExecutor(1, "operator") as pool:
+            work = pool.submit(self._touch_all)
+            try:
+                yield
+            finally:
+                if work.done():
+                    work.result()
+
+    def _touch_all(self) -> None:
+        for _ in range(self._count):
+            self.command("touch", timeout_s=60.0)
+
+
+def touch(truth: LabTruth, rig: Rig, count: int) -> Iterator[int]:
+    """Touches `count` points spread over the object, one at a time, and yields how many it has touched."""
+    T_tip_tcp = SE3.from_rotvec(np.zeros(3), -np.array(truth.tcp_tip))
+    with UrRobot(rig.robot) as arm:
+        q = arm.sample().q
+        touched = 0
+        for point, normal in _contacts(truth, 6 * count):
+            contact = _tip_pose(point, normal) @ T_tip_tcp
+            retreat = SE3(contact.rotation, contact.translation - _RETREAT_M * contact.rotation[:, 2])
+            q_contact = arm.inverse_kinematics(contact, q)
+            q_retreat = None if q_contact is None else arm.inverse_kinematics(retreat, q_contact)
+            if q_contact is None or q_retreat is None or np.abs(q_contact - q).max() > np.pi:
+                continue
+            arm.follow(np.stack([q_retreat, q_contact]), blend=0.01)
+            time.sleep(_HOLD_S)
+            arm.follow(q_retreat[None])
+            q = q_retreat
+            touched += 1
+            yield touched
+            if touched == count:
+                return
+
+
+def _contacts(truth: LabTruth, candidates: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Points and outward normals in the base frame that a tip from above can reach, far ones first after each other."""
+    rng = np.random.default_rng(truth.seed + 3)
+    mesh = objects.build(truth.object_name)
+    corners = mesh.vertices[mesh.faces]
+    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(crosses, axis=1)
+    chosen = rng.choice(len(areas), size=candidates, p=areas / areas.sum())
+    weights = rng.dirichlet((1.0, 1.0, 1.0), size=candidates)
+    points = truth.T_base_object.apply((weights[:, :, None] * corners[chosen]).sum(axis=1))
+    normals = (crosses[chosen] / areas[chosen, None]) @ truth.T_base_object.rotation.T
+    outside = _faces_outwards(points, normals, truth)
+    for index in np.flatnonzero((points[:, 2] > _CLEARANCE_M) & (normals[:, 2] > -0.3) & outside):
+        yield points[index] + normals[index] * rng.normal(0, truth.touch_noise_m), normals[index]
+
+
+def _faces_outwards(points: NDArray[np.float64], normals: NDArray[np.float64], truth: LabTruth) -> NDArray[np.bool_]:
+    """Not the inside of a cup: the wall faces away from the object's axis, or it faces up."""
+    away = points - truth.T_base_object.translation
+    return (np.einsum("ij,ij->i", away[:, :2], normals[:, :2]) > 0) | (normals[:, 2] > 0.8)
+
+
+def _tip_pose(point: NDArray[np.float64], normal: NDArray[np.float64]) -> SE3:
+    """The tip at a point, its axis mostly downwards and a little against the surface."""
+    axis = np.array([0.0, 0.0, -1.0]) - 0.35 * normal
+    z = axis / np.linalg.norm(axis)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return SE3(np.stack([x, np.cross(z, x), z], axis=1), point)
+
+
+def main() -> None:
+    """Touches until done; the process then waits for its parent to end it."""
+    die_with_parent()
+    parser = argparse.ArgumentParser(description="Touches the object of a simulated lab with the arm's tip.")
+    parser.add_argument("--truth", type=Path, required=True)
+    parser.add_argument("--rig", type=Path, required=True)
+    parser.add_argument("--count", type=int, required=True)
+    options = parser.parse_args()
+    touches = touch(LabTruth.load(options.truth), Rig.load(options.rig), options.count)
+
+    def handle(line: str) -> str:
+        if line != "touch":
+            raise ValueError(f"unknown command '{line}'; use touch")
+        return str(next(touches, options.count))
+
+    serve_commands(handle)
+
+
+if __name__ == "__main__":
+    main()

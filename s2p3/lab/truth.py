@@ -1,0 +1,158 @@
+"""What is true in the simulated lab: drawn from a seed, known to the simulators, never told to the toolkit.
+
+Only two readers exist: the simulated camera (which renders it) and the demo's last step (which compares what was recovered).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dataset.errors import ToolkitError
+from dataset.intrinsics import Intrinsics
+from dataset.transforms import SE3
+
+MOSAIC_HEIGHT, MOSAIC_WIDTH = 2048, 2448
+
+
+@dataclass(frozen=True)
+class LabTruth:
+    """The hidden state of one simulated lab. Poses are UR pose vectors (6,): metres and a rotation vector in radians."""
+
+    seed: int
+    object_name: str
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...]
+    """OpenCV's k1 k2 p1 p2 k3."""
+    tcp_cam: tuple[float, ...]
+    base_board: tuple[float, ...]
+    base_object: tuple[float, ...]
+    tcp_tip: tuple[float, ...]
+    """The tip's position in the flange frame, metres."""
+    latency_s: float
+    """From the start of an exposure to its first packet on the wire; rendering takes most of it."""
+    exposure_offset_s: float
+    """How long before the time the camera stamps the exposure really happened."""
+    camera_drift_ppm: float
+    """How much too fast the camera's clock runs."""
+    arm_drift_ppm: float
+    """How much too fast the arm controller's clock runs."""
+    refractive_index: float
+    dolp_scale: float
+    read_noise: float
+    full_well: float
+    touch_noise_m: float
+    """Standard deviation of a touched point along the surface normal: the tip's ball, the operator's hand."""
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        K = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+        return Intrinsics(K, np.array(self.distortion), MOSAIC_HEIGHT, MOSAIC_WIDTH)
+
+    @property
+    def T_tcp_cam(self) -> SE3:
+        return SE3.from_pose6(np.array(self.tcp_cam))
+
+    @property
+    def T_base_board(self) -> SE3:
+        return SE3.from_pose6(np.array(self.base_board))
+
+    @property
+    def T_base_object(self) -> SE3:
+        return SE3.from_pose6(np.array(self.base_object))
+
+    @property
+    def time_offset_s(self) -> float:
+        """What has to be added to a frame's time on the host to find the arm's pose at its exposure."""
+        return -(self.latency_s + self.exposure_offset_s)
+
+    def save(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(asdict(self), indent=1))
+
+    @staticmethod
+    def load(path: Path) -> LabTruth:
+        try:
+            values = json.loads(path.read_text())
+            return LabTruth(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        except (OSError, ValueError, TypeError) as error:
+            raise ToolkitError(f"{path} is not the truth of a simulated lab ({error}); start the lab afresh in a new folder.") from error
+
+
+# The furniture that a rig file knows roughly, as one knows it with a tape measure.
+NOMINAL_TCP_CAM = (0.0, -0.075, 0.045, 0.0, 0.0, 0.0)
+NOMINAL_BOARD_CENTRE = (0.45, -0.22, 0.0)
+NOMINAL_OBJECT_CENTRE = (0.45, 0.20, 0.0)
+TCP_TIP = (0.0, 0.0, 0.18)
+NOMINAL_FOCAL_PX = 1739.0
+"""A 6 mm lens on 3.45 um pixels."""
+
+
+def sample_truth(
+    seed: int, object_name: str, nominal_index: float, board_size_m: tuple[float, float], T_table_object: SE3
+) -> LabTruth:
+    """Draw one lab.
+
+    Args:
+        seed: the same seed, the same lab.
+        object_name: the object that lies on the table.
+        nominal_index: the refractive index the object's model file states; the real one is a few percent off.
+        board_size_m: width and height of the board, metres.
+        T_table_object: how the object rests on a table whose normal is +z.
+    """
+    rng = np.random.default_rng(seed)
+    focal = NOMINAL_FOCAL_PX * rng.uniform(0.97, 1.03)
+    tcp_cam = SE3.from_pose6(np.array(NOMINAL_TCP_CAM)) @ _small_motion(rng, translation_m=0.006, rotation_rad=0.06)
+    yaw = rng.uniform(-0.25, 0.25)
+    # OpenCV's board frame starts at a corner, x along the squares and z into the board: down, for a board on a table.
+    flat = SE3.from_rotvec(np.array([np.pi, 0.0, 0.0]), np.zeros(3))
+    centre = SE3.from_rotvec(np.zeros(3), -np.array([*board_size_m, 0.0]) / 2)
+    T_base_board = _on_table(rng, NOMINAL_BOARD_CENTRE, yaw) @ flat @ centre
+    T_base_object = _on_table(rng, NOMINAL_OBJECT_CENTRE, rng.uniform(-np.pi, np.pi)) @ T_table_object
+    return LabTruth(
+        seed=seed,
+        object_name=object_name,
+        fx=focal,
+        fy=focal * rng.uniform(0.999, 1.001),
+        cx=(MOSAIC_WIDTH - 1) / 2 + rng.uniform(-25, 25),
+        cy=(MOSAIC_HEIGHT - 1) / 2 + rng.uniform(-25, 25),
+        distortion=(
+            rng.uniform(-0.11, -0.07),
+            rng.uniform(0.05, 0.09),
+            rng.uniform(-4e-4, 4e-4),
+            rng.uniform(-4e-4, 4e-4),
+            0.0,
+        ),
+        tcp_cam=_tuple(tcp_cam),
+        base_board=_tuple(T_base_board),
+        base_object=_tuple(T_base_object),
+        tcp_tip=TCP_TIP,
+        latency_s=rng.uniform(0.0, 0.03),
+        exposure_offset_s=rng.uniform(0.020, 0.040),
+        camera_drift_ppm=rng.uniform(-60, 60),
+        arm_drift_ppm=rng.uniform(-60, 60),
+        refractive_index=nominal_index * rng.uniform(1.03, 1.08),
+        dolp_scale=rng.uniform(0.93, 0.97),
+        read_noise=2.5,
+        full_well=10_000.0,
+        touch_noise_m=1e-4,
+    )
+
+
+def _small_motion(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> SE3:
+    return SE3.from_rotvec(rng.uniform(-rotation_rad, rotation_rad, 3), rng.uniform(-translation_m, translation_m, 3))
+
+
+def _on_table(rng: np.random.Generator, centre: tuple[float, float, float], yaw: float) -> SE3:
+    jitter = np.array([*rng.uniform(-0.02, 0.02, 2), 0.0])
+    return SE3.from_rotvec(np.array([0.0, 0.0, yaw]), np.array(centre) + jitter)
+
+
+def _tuple(pose: SE3) -> tuple[float, ...]:
+    return tuple(float(value) for value in pose.as_pose6())

@@ -1,0 +1,63 @@
+"""The two stages that meet captured frames, addressed as a lab does: a session, the name of a split, checkpoints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dataset.errors import SessionError
+from dataset.session import Session
+from s2p3.config import SelfSupervisionConfig
+from s2p3.evaluation import Evaluation, evaluate, find_objects
+from s2p3.objects import ObjectModel
+from s2p3.training import captured_crops, self_supervise
+from s2p3.training.checkpoint import read_info
+
+
+def adapt(
+    session: Path,
+    split: str,
+    model: ObjectModel,
+    detector: Path,
+    teacher: Path,
+    student: Path,
+    out: Path,
+    settings: SelfSupervisionConfig | None = None,
+) -> Path:
+    """Self-supervised training of a student on a split of captured frames; no pose of the session is read.
+
+    Returns:
+        `out`/adapted.safetensors.
+
+    Raises:
+        SessionError: no such split.
+        ToolkitError: the object is detected in no frame; checkpoints of another object.
+    """
+    config = read_info(student, "student", model.name).config
+    with Session.open(session) as opened:
+        indices = frames_of(opened, split)
+        detections = find_objects(opened, indices, detector, model.name)
+        crops = captured_crops(opened, indices, detections, config.input)
+    return self_supervise(crops, model, teacher, student, out, settings or config.self_supervision)
+
+
+def evaluate_split(session: Path, split: str, model: ObjectModel, network: Path, detector: Path) -> Evaluation:
+    """Evaluates a network on a split of an annotated session, see `evaluation.evaluate`.
+
+    Raises:
+        SessionError: no such split, or the object was not annotated.
+        ToolkitError: checkpoints of another object.
+    """
+    with Session.open(session) as opened:
+        return evaluate(opened, frames_of(opened, split), model, network, detector)
+
+
+def frames_of(session: Session, split: str) -> list[int]:
+    """Frame indices of a split.
+
+    Raises:
+        SessionError: the session has no such split.
+    """
+    if split not in session.splits:
+        known = ", ".join(session.splits) or "none"
+        raise SessionError(f"{session.path}: no split {split!r} (its splits: {known}); make one with: s2p3 dataset split {session.path}")
+    return [int(index) for index in session.splits[split]]

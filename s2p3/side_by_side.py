@@ -1,0 +1,92 @@
+"""Runs trainings side by side, a process and a thread each: two threads that share one training are slower."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from dataset.errors import ToolkitError
+from s2p3.commands.output import counting_many
+
+_POLL_S = 1.0
+_TAIL_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Training:
+    """One command and how to see how far it is.
+
+    Attributes:
+        words: of the `s2p3` command line.
+        log: JSON lines with a "step" that the training appends to.
+        steps: how many it takes.
+    """
+
+    words: tuple[str, ...]
+    log: Path
+    steps: int
+
+
+def run_side_by_side(trainings: Mapping[str, Training]) -> None:
+    """Runs all trainings at once and shows how far each is.
+
+    Raises:
+        ToolkitError: one of them failed, with the last line it wrote; the others are stopped, and go on from their
+            checkpoints next time.
+    """
+    with ExitStack() as stack:
+        running = {name: _start(training, stack) for name, training in trainings.items()}
+        report = stack.enter_context(counting_many(trainings))
+        while True:
+            codes = {name: process.poll() for name, process in running.items()}
+            for name, training in trainings.items():
+                report(name, training.steps if codes[name] == 0 else _last_step(training.log), training.steps)
+                if codes[name]:
+                    raise ToolkitError(f"{name}: training failed: {_last_words(_output(training))}")
+            if all(code == 0 for code in codes.values()):
+                return
+            time.sleep(_POLL_S)
+
+
+def _start(training: Training, stack: ExitStack) -> subprocess.Popen[bytes]:
+    training.log.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "s2p3.cli", *training.words]
+    with _output(training).open("wb") as stream:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT)
+    stack.callback(_end, process)
+    return process
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(10)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _output(training: Training) -> Path:
+    return training.log.with_suffix(".out")
+
+
+def _last_step(log: Path) -> int:
+    """The step on the last complete line of a log that is being written; 0 where there is none."""
+    if not log.exists():
+        return 0
+    with log.open("rb") as stream:
+        stream.seek(max(0, log.stat().st_size - _TAIL_BYTES))
+        lines = stream.read().split(b"\n")
+    complete = [line for line in lines[:-1] if line.startswith(b"{")]
+    return int(json.loads(complete[-1])["step"]) if complete else 0
+
+
+def _last_words(output: Path) -> str:
+    lines = [line.strip() for line in output.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else f"see {output}"

@@ -32,6 +32,8 @@ GVCP_PORT = 3956
 _SENSOR_WIDTH, _SENSOR_HEIGHT, _WIDTH, _HEIGHT = 0x11C, 0x118, 0x100, 0x104
 _PIXEL_FORMAT, _PERIOD_US, _TRIGGER_MODE, _PACKET_SIZE = 0x128, 0x138, 0x300, 0xD04
 _STRINGS = {"vendor": (0x48, 32), "model": (0x68, 32), "version": (0x88, 32), "info": (0xA8, 48)}
+# A client writes 1 to start and 0 to stop; to the device everything but 0 means on.
+_ACQUISITION, _STARTED, _IN_STEP = 0x124, 1, 2
 # Ours, as genicam.xml has it.
 _EXPOSURE_AUTO, _AUTO_CONTINUOUS = 0xA000, 2
 
@@ -113,7 +115,6 @@ class FakeDevice:
             )
         self._library.arv_fake_camera_set_trigger_frequency(self._pointer, trigger_poll_hz)
         self._fill = fill
-        self._filled_us = 0
         # Kept: the device calls it as long as it lives.
         self._callback = _FILL(self._on_fill)
         self._library.arv_fake_camera_set_fill_pattern(self._pointer, self._callback, None)
@@ -135,14 +136,14 @@ class FakeDevice:
         Running free, the device sends at whole multiples of the period on the wall clock, but the first frame
         at once; a camera's frames are equally spaced from the first on.
         """
+        _, acquisition = self._camera.read_register(_ACQUISITION)
+        if acquisition != _STARTED:
+            return
+        self._camera.write_register(_ACQUISITION, _IN_STEP)
         _, period_us = self._camera.read_register(_PERIOD_US)
         _, triggered = self._camera.read_register(_TRIGGER_MODE)
-        now_us = time.time_ns() // 1000
-        phase_us = now_us % period_us
-        first = now_us - self._filled_us > 1.5 * period_us and phase_us > period_us / 4
-        if first and not triggered and period_us <= _LONGEST_WAIT_US:
-            time.sleep((period_us - phase_us) * 1e-6)
-        self._filled_us = time.time_ns() // 1000
+        if not triggered and period_us <= _LONGEST_WAIT_US:
+            time.sleep((period_us - time.time_ns() // 1000 % period_us) * 1e-6)
 
     def _on_fill(self, buffer: int, user: int | None, exposure_us: int, gain: int, code: int) -> None:
         try:

@@ -174,8 +174,8 @@ def plan_path(
 
     The roll of the camera about its axis is free within `rolls`; the arm keeps one way of bending its
     shoulder, wrist and elbow, the one that reaches most views, so that it never turns over. Of all the
-    sequences of rolls the one with the least sum of squared joint steps is taken (Viterbi). Where an obstacle is between
-    two waypoints the arm goes by way of `q_start`.
+    sequences of rolls the one with the least sum of squared joint steps is taken (Viterbi). Where
+    an obstacle is between two waypoints the arm goes by way of `q_start`.
 
     Args:
         T_base_cam: a batch of M views in the order of travel.

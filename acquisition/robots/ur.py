@@ -205,7 +205,7 @@ class UrRobot(Robot):
                     if self._stop_requested.is_set():
                         self._motion.ask("stop", deceleration=_STOP_DECELERATION)
                         raise MotionStopped(
-                            f"the arm {self.config.host} was told to stop on its way; command it again to"
+                            f"the arm {self.config.host} was told to stop on its way; command it again"
                         )
                     time.sleep(_POLL_S)
             except (KeyboardInterrupt, SystemExit):

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from acquisition.simulation.kinematics import JOINT_LIMIT, link_transforms
 from acquisition.simulation.motion import Motion
-from dataset.transforms import SE3, matrix_to_rotvec
+from dataset.transforms import SE3
 
 Floats = NDArray[np.float64]
 
@@ -43,6 +44,7 @@ class Arm:
         self.motion: Motion | None = None
         self.safety_bits, self.safety_mode, self.robot_mode = NORMAL_BITS, NORMAL_MODE, RUNNING
         self.last_stop = ""  # why the arm last stopped itself
+        self._tool_velocity = np.zeros(3)
         self.set_tcp(np.zeros(6))
         self._update()
 
@@ -74,9 +76,10 @@ class Arm:
         if self.motion is None:
             self.qd = np.zeros(6)
             return
-        before = self.q
+        before, position = self.q, self.T_base_tcp[:3, 3]
         self.q, self.qd, ended = self.motion.advance(self.q, self.qd, dt)
         self._update()
+        self._tool_velocity = (self.T_base_tcp[:3, 3] - position) / dt
         reason = self._violation()
         if reason:
             self.q = before
@@ -102,14 +105,16 @@ class Arm:
 
     def tcp_speed(self) -> Floats:
         """(6,) linear and angular velocity of the tool centre point in the base frame, m/s and rad/s."""
-        axes = self._links[:6, :3, 2]
-        levers = self.T_base_tcp[:3, 3] - self._links[:6, :3, 3]
-        return np.concatenate([self.qd @ np.cross(axes, levers), self.qd @ axes])
+        if self.motion is None:
+            return np.zeros(6)
+        return np.concatenate([self._tool_velocity, self.qd @ self._links[:6, :3, 2]])
 
     def _update(self) -> None:
         self._links = link_transforms(self.q)
         self.T_base_tcp: Floats = self._links[6] @ self._T_flange_tcp
-        self.tcp_pose = np.concatenate([self.T_base_tcp[:3, 3], matrix_to_rotvec(self.T_base_tcp[:3, :3])])
+        # Compiled code, faster than the toolkit's own by far: this runs in every control period.
+        rotvec = Rotation.from_matrix(self.T_base_tcp[:3, :3]).as_rotvec()
+        self.tcp_pose = np.concatenate([self.T_base_tcp[:3, 3], rotvec])
 
     def _violation(self) -> str:
         if np.abs(self.q).max() > JOINT_LIMIT:

@@ -189,7 +189,7 @@ class Controller:
     def _publish(self, true_time_s: float) -> None:
         arm, values = self.arm, self.values
         q, qd, pose = arm.q.tolist(), arm.qd.tolist(), arm.tcp_pose.tolist()
-        speed = [0.0] * 6 if arm.motion is None else arm.tcp_speed().tolist()
+        speed = arm.tcp_speed().tolist()
         values.update(
             timestamp=self._clock_s,
             actual_q=q,
@@ -208,10 +208,8 @@ class Controller:
             robot_status_bits=1 | (2 if self._runtime == _PLAYING else 0),
         )
         self.registers.output_double[TRUE_TIME_REGISTER] = true_time_s
-        for i, number in enumerate(self.registers.output_int):
-            values[_INT_REGISTERS[i]] = number
-        for i, real in enumerate(self.registers.output_double):
-            values[_DOUBLE_REGISTERS[i]] = real
+        values.update(zip(_INT_REGISTERS, self.registers.output_int, strict=True))
+        values.update(zip(_DOUBLE_REGISTERS, self.registers.output_double, strict=True))
 
 
 _INT_REGISTERS = [f"output_int_register_{i}" for i in range(REGISTERS)]

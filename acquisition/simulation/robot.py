@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import re
 import socket
 import sys
@@ -30,6 +31,7 @@ SCRIPT_PORTS = (30003, 30002)
 DASHBOARD_PORT = 29999
 
 _PROGRAM_END = re.compile(r"^end[ \t]*\r?\n", re.MULTILINE)
+_PRIORITY = -10  # where it is permitted: a real controller is not held up by the host's other work
 _LARGEST_LAG_S = 0.5  # beyond it the arm lost time; it goes on from now instead of catching up
 
 
@@ -51,6 +53,8 @@ class SimulatedRobot(SimulatorProcess):
 def main() -> int:
     """Serves until stdin ends or the parent process dies. Returns the exit code."""
     die_with_parent()
+    with contextlib.suppress(PermissionError):
+        os.nice(_PRIORITY)
     parser = argparse.ArgumentParser(description="A simulated UR5e controller on the loopback network.")
     parser.add_argument("--host", default="127.0.0.1", help="address to serve at (127.0.0.1)")
     parser.add_argument("--rate", type=float, default=500.0, help="control rate, Hz (500)")

@@ -109,7 +109,8 @@ def _robust_line(times_s: Floats, values_ns: Floats) -> tuple[float, float, floa
         value = float(np.median(values_ns - slope * centred))
     for _ in range(_ROUNDS):
         residual = values_ns - value - slope * centred
-        scatter = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), 1.0)
+        residual -= np.median(residual)  # where most lie on another line than the last, they pull it over
+        scatter = max(1.4826 * float(np.median(np.abs(residual))), 1.0)
         weight = np.clip(1 - (residual / (_TUKEY * scatter)) ** 2, 0, None) ** 2
         prior = (scatter / (_CRYSTAL_PPM * 1e3)) ** 2  # the rate is 0 +- 50 ppm, that is 50 000 ns per second
         normal = np.array(

@@ -18,6 +18,7 @@ from calibration.object_pose import ObjectPoseResult, register_points
 from calibration.result import Calibration, HandEyeRecord, IntrinsicsRecord
 from calibration.time_offset import TimeOffsetResult, estimate_time_offset
 from dataset.errors import CalibrationError
+from dataset.rests import find_rests
 from dataset.session import Session
 from dataset.transforms import SE3, interpolate_poses
 
@@ -82,20 +83,30 @@ def hand_eye_from_session(
         CalibrationError: as `detect_session` and `calibrate_hand_eye`, or no robot trace.
     """
     detections = detect_session(session, spec) if detections is None else detections
+    views, poses = views_at_rest(session, detections)
+    return calibrate_hand_eye(
+        poses, [d for _, d in views], spec, intrinsics.intrinsics, intrinsics.covariance
+    )
+
+
+def views_at_rest(session: Session, detections: Detections) -> tuple[Detections, SE3]:
+    """The detections taken while the arm stood still, and T_base_tcp of each.
+
+    Raises:
+        CalibrationError: the arm never stood still, or there is no robot trace.
+    """
     times, trace = arm_trace(session)
-    views: list[Detection] = []
-    poses: list[SE3] = []
-    for index, detection in detections:
-        pose = rest_pose(times, trace, int(session.mid_exposure_host_ns[index]))
-        if pose is not None:
-            views.append(detection)
-            poses.append(pose)
-    if detections and not poses:
+    found = [
+        (index, detection, rest_pose(times, trace, int(session.mid_exposure_host_ns[index])))
+        for index, detection in detections
+    ]
+    still = [(index, detection, pose) for index, detection, pose in found if pose is not None]
+    if not still:
         raise CalibrationError(
             f"{session.path}: the arm was never at rest when a picture was taken; record stills with"
             " `s2p3 capture hand-eye`, which waits for the arm to settle"
         )
-    return calibrate_hand_eye(SE3.stack(poses), views, spec, intrinsics.intrinsics, intrinsics.covariance)
+    return [(index, detection) for index, detection, _ in still], SE3.stack([pose for _, _, pose in still])
 
 
 def time_offset_from_session(
@@ -152,13 +163,16 @@ def object_from_touches(
 
 
 def touched_points(session: Session, tip_in_tcp: ArrayLike) -> Floats:
-    """(n, 3) where the tool's tip was, in the base frame, in each frame of a session; the arm at rest.
+    """(n, 3) where the tool's tip was, in the base frame, at each rest of a hand-guided session, or in each
+    frame of a session that has frames; the arm at rest.
 
     Raises:
         CalibrationError: no robot trace, or the arm moved at a touch.
     """
     times, trace = arm_trace(session)
     points: list[Floats] = []
+    if len(session) == 0 and session.robot is not None:
+        points = [rest.T_base_tcp.apply(tip_in_tcp) for rest in find_rests(session.robot)]
     for index in range(len(session)):
         pose = rest_pose(times, trace, int(session.mid_exposure_host_ns[index]))
         if pose is None:

@@ -100,3 +100,18 @@ def test_wrong_unit_is_noticed() -> None:
     device, host, _ = capture(10, 50, 0, 0.1e-3)
     with pytest.raises(ToolkitError, match="not in nanoseconds"):
         fit_clock((device - device[0]) // 1000, host)
+
+
+@pytest.mark.parametrize("seed", [22, 189, 527, 679, 738, 812, 829, 841])
+def test_a_short_capture_in_bursts_on_a_busy_host_is_fitted(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count, rate_hz = int(rng.integers(5, 300)), float(rng.choice([10, 100, 500]))
+    device = (np.arange(count) * 1e9 / rate_hz).astype(np.int64) + 10**12
+    late_ns = rng.exponential(10 ** rng.uniform(3, 7.5), count).astype(np.int64)
+    host = np.maximum.accumulate(HOST_EPOCH_NS + device + late_ns)
+    burst = int(rng.integers(1, 60))  # packets that are read together share their arrival
+    host = host[np.minimum((np.arange(count) // burst + 1) * burst - 1, count - 1)]
+    fit = fit_clock(device, host)
+    assert abs(fit.b - 1) < 1e-2
+    lateness = host - fit.to_host(device)
+    assert -1e6 < np.median(lateness) < 1e9

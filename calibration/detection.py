@@ -83,14 +83,14 @@ def explain_missing_board(image: NDArray[np.generic], spec: BoardSpec) -> str:
             f"{len(found)} markers of {spec.dictionary} are visible but do not lie as on a"
             f" {spec.squares_x}x{spec.squares_y} board: check squares_x, squares_y and marker_m / square_m"
         )
+    if len(_marker_ids(np.ascontiguousarray(grey[:, ::-1]), spec.dictionary)) >= 3:
+        return "the markers are mirrored: switch off image flipping in the camera (ReverseX or ReverseY)"
     # Small dictionaries are prefixes of the larger ones: the smallest that explains the markers is tried
     # first.
     candidates = {name: _marker_ids(grey, name) for name in DICTIONARIES if name != spec.dictionary}
     best = max(candidates, key=lambda name: len(candidates[name]))
     if len(candidates[best]) >= 3:
         return f"markers of {best} are visible, the board is described with {spec.dictionary}: correct it"
-    if len(_marker_ids(np.ascontiguousarray(grey[:, ::-1]), spec.dictionary)) >= 3:
-        return "the markers are mirrored: switch off image flipping in the camera (ReverseX or ReverseY)"
     return "no marker of any dictionary is visible: check exposure, focus, and that the board is in view"
 
 

@@ -37,7 +37,9 @@ _ARM_FLOOR = np.array(
     [2e-6] * 3 + [5e-6] * 3
 )  # no arm repeats better; keeps the variance components positive
 _PIXEL_FLOOR = 5e-3
-_MAX_DEVIATION = 6.0  # of the views' typical deviation: farther off is an outlier
+_MAX_ERROR = 5.0  # of the views' median error: farther off is an outlier
+_NO_ARM_M = 10e-3  # a typical arm is never this wrong: the poses are not what they are taken for
+_NO_ARM_RAD = np.radians(2.0)
 _FOLDS = 5
 _TRANSFORMS = 12  # shared parameters before the board's scale and the camera's own
 _SCALE = 12
@@ -63,6 +65,7 @@ class HandEyeResult:
         board_scale, board_scale_sigma: the board's size against its description, as the arm's motion
             measures it.
         T_base_cam: N camera poses.
+        board_size_m: width and height of the board, for drawing it.
         view, pixels, residual_px: (P,), (P, 2), (P, 2) every corner: its view, where seen, rigid predicted -
             seen.
     """
@@ -84,6 +87,7 @@ class HandEyeResult:
     board_scale: float
     board_scale_sigma: float
     T_base_cam: SE3
+    board_size_m: tuple[float, float]
     view: NDArray[np.int64]
     pixels: Floats
     residual_px: Floats
@@ -162,6 +166,7 @@ def calibrate_hand_eye(
         board_scale=scale,
         board_scale_sigma=scale_sigma,
         T_base_cam=T_base_tcp @ state_used.T_tcp_cam,
+        board_size_m=spec.size_m,
         view=observations.view,
         pixels=observations.pixels,
         residual_px=residual,
@@ -261,20 +266,34 @@ def _reject_outlier_views(state: _State, observations: Observations) -> tuple[Bo
     """Views whose arm pose (or board) is far off the others': reweighted until the rest agree, then named."""
     count = observations.view_count
     spread = np.ones(count)
-    deviation = np.zeros(count)
     for _ in range(8):
         state, _ = solve(state, observations, 0.3, _LOOSE_ARM * spread[:, None], state.free(scale=True))
         deviation = np.linalg.norm(state.offset / _LOOSE_ARM, axis=1)
         typical = max(float(np.median(deviation)), 1e-3)
         # Student's t with 3 degrees of freedom: a view twice as far off as usual counts half, one far off
         # hardly.
-        spread = np.sqrt((3.0 + (deviation / typical) ** 2) / 4.0)
-    used = deviation <= _MAX_DEVIATION * max(float(np.median(deviation)), 0.02)
+        before, spread = spread, np.sqrt((3.0 + (deviation / typical) ** 2) / 4.0)
+        if np.allclose(spread, before, rtol=0.05):
+            break
+    typical_m, typical_rad = np.median(np.linalg.norm(state.offset.reshape(count, 2, 3), axis=2), axis=0)
+    if typical_m > _NO_ARM_M or typical_rad > _NO_ARM_RAD:
+        raise CalibrationError(
+            f"hand-eye: no common transform fits, the arm would have to be off by {1000 * typical_m:.0f} mm"
+            " and"
+            f" {np.degrees(typical_rad):.1f} degrees in a typical view; check that poses are base<-tcp (not"
+            " inverted), in"
+            " metres, and belong to the pictures"
+        )
+    # Judged by the picture, with the arm taken at its word: a view with few corners is not an outlier for
+    # that.
+    rigid = replace(state, offset=np.zeros_like(state.offset)).linearize(observations).residual
+    error = observations.view_rms(rigid)
+    used = error <= _MAX_ERROR * np.median(error) + 0.3
     if np.count_nonzero(used) < max(MIN_POSES, count // 2):
         raise CalibrationError(
             f"hand-eye: {count - np.count_nonzero(used)} of {count} views contradict the others; check that"
-            " the board and"
-            " the base did not move, and that arm poses are base<-tcp at the time of each picture"
+            " the"
+            " board and the base did not move, and that arm poses are base<-tcp at the time of each picture"
         )
     return used, state
 

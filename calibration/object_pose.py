@@ -18,7 +18,8 @@ Floats = NDArray[np.float64]
 MIN_POINTS = 6
 _SAMPLES = 20_000
 _STARTS = 240
-_COARSE_STEPS = 30
+_COARSE_STEPS = 12
+_PROMISING = 80
 _FINE_STEPS = 40
 _FINE_STARTS = 8
 _TURN_STEPS = 12
@@ -81,19 +82,17 @@ def register_points(
     """
     points = _checked(points_base)
     mesh = trimesh.Trimesh(np.asarray(vertices, np.float64), np.asarray(faces), process=False)
+    _require_size(points, mesh)
     surface = _Surface.of(mesh, seed)
     coarse, coarse_rms = _coarse(points, surface, _starts(points, surface, init, seed), _COARSE_STEPS)
+    promising = np.argsort(coarse_rms)[:_PROMISING]
+    coarse, coarse_rms = _coarse(points, surface, coarse[promising], 2 * _COARSE_STEPS)
     best = coarse[int(np.argmin(coarse_rms))]
+    limit = max(_BAD_FIT_M, 0.03 * float(np.linalg.norm(mesh.extents)))
+    _require_fit(float(coarse_rms.min()), 3 * limit, mesh)
     pose, signed, J = _finest(points, mesh, best, surface.radius, seed)
     rms = float(np.sqrt(np.mean(signed**2)))
-    extent = float(np.linalg.norm(mesh.extents))
-    if rms > max(_BAD_FIT_M, 0.03 * extent):
-        raise CalibrationError(
-            f"object pose: the best fit leaves the points {1000 * rms:.1f} mm from the surface; check the"
-            " mesh's units"
-            f" (it is {1000 * extent:.0f} mm across), the tool tip's offset, and that the right object was"
-            " touched"
-        )
+    _require_fit(rms, limit, mesh)
     noise = max(float(np.sqrt(np.sum(signed**2) / max(len(points) - 6, 1))), _NOISE_FLOOR_M)
     covariance, weak = _covariance(J, noise, surface.radius)
     ambiguity, weak = _turns_that_fit(points, mesh, surface, pose, weak, noise)
@@ -157,6 +156,27 @@ def _checked(points_base: ArrayLike) -> Floats:
             "object pose: the points lie in one spot or on one line; touch the object on different sides"
         )
     return points
+
+
+def _require_size(points: Floats, mesh: trimesh.Trimesh) -> None:
+    span = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
+    across = float(np.linalg.norm(mesh.extents))
+    if span > across + _BAD_FIT_M:
+        raise CalibrationError(
+            f"object pose: a point lies {1000 * span:.0f} mm from the points' mean, the mesh is only"
+            f" {1000 * across:.0f} mm across; check the mesh's units (metres) and the points for strays"
+        )
+
+
+def _require_fit(rms: float, limit: float, mesh: trimesh.Trimesh) -> None:
+    if rms > limit:
+        raise CalibrationError(
+            f"object pose: the best fit leaves the points {1000 * rms:.1f} mm from the surface; check the"
+            " mesh's"
+            f" units (it is {1000 * np.linalg.norm(mesh.extents):.0f} mm across), the tool tip's offset,"
+            " and that"
+            " the right object was touched"
+        )
 
 
 def _starts(points: Floats, surface: _Surface, init: SE3 | None, seed: int) -> SE3:

@@ -1,0 +1,303 @@
+"""The calibration report: one self-contained HTML page, pictures before numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration import html, plots
+from calibration.board import BoardSpec
+from calibration.detection import intensity_image
+from calibration.hand_eye import HandEyeResult
+from calibration.intrinsics import IntrinsicsResult
+from calibration.object_pose import ObjectPoseResult
+from calibration.time_offset import TimeOffsetResult
+from dataset.frames import Mosaic
+from dataset.polarimetry import Raw
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPicture:
+    """A raw mosaic (H, W) to draw corners on, its layout, and which of the results' views it is."""
+
+    raw: Raw
+    layout: Mosaic
+    view: int
+
+
+@dataclass(frozen=True, eq=False)
+class TouchedObject:
+    """An object's result with what it was computed from: points (n, 3) in the base frame, and the mesh."""
+
+    result: ObjectPoseResult
+    points_base: NDArray[np.float64]
+    vertices: ArrayLike
+    faces: ArrayLike
+
+
+def calibration_report(
+    spec: BoardSpec | None,
+    intrinsics: IntrinsicsResult | None = None,
+    hand_eye: HandEyeResult | None = None,
+    time_offset: TimeOffsetResult | None = None,
+    objects: Mapping[str, TouchedObject] | None = None,
+    pictures: Sequence[ViewPicture] = (),
+    title: str = "Calibration report",
+    subtitle: str = "",
+) -> str:
+    """The page as text, with a section for every result given.
+
+    Args:
+        spec: the board, where one was used.
+        intrinsics, hand_eye, time_offset, objects: results.
+        pictures: of views of ``hand_eye`` where given, else of ``intrinsics``, to draw the corners on.
+        title, subtitle: of the page.
+    """
+    sections: list[str] = []
+    if intrinsics is not None:
+        sections.append(_intrinsics(intrinsics, pictures if hand_eye is None else ()))
+    if hand_eye is not None:
+        sections.append(_hand_eye(hand_eye, pictures))
+    if time_offset is not None:
+        sections.append(_time_offset(time_offset))
+    sections += [_object(name, touched) for name, touched in (objects or {}).items()]
+    return html.page(title, subtitle, sections, "" if spec is None else _describe(spec))
+
+
+def _describe(spec: BoardSpec) -> str:
+    return (
+        f"Board: {spec.squares_x} x {spec.squares_y} squares of {1e3 * spec.square_m:g} mm, markers of"
+        f" {1e3 * spec.marker_m:g} mm, {spec.dictionary}."
+    )
+
+
+def _intrinsics(result: IntrinsicsResult, pictures: Sequence[ViewPicture]) -> str:
+    camera, sigma = result.intrinsics, result.sigma
+    size = camera.height, camera.width
+    outlier = ~result.used[result.view]
+    field, magnify = plots.residual_field(result.pixels, result.residual_px, outlier, size)
+    names = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
+    values = [*camera.K[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion]
+    rows = [
+        [
+            name,
+            f"{v:.3f}" if i < 4 else f"{v:.6f}",
+            f"{s:.3f}" if i < 4 else f"{s:.6f}",
+            "px" if i < 4 else "1",
+        ]
+        for i, (name, v, s) in enumerate(zip(names, values, sigma, strict=False))
+    ]
+    relative = 100 * sigma[0] / camera.K[0, 0]
+    rejected = np.flatnonzero(~result.used)
+    labels = [str(i) for i in range(len(result.used))]
+    return html.section(
+        "Intrinsics",
+        "Each dot is a board corner. A good calibration leaves a small round cloud without a pattern over the"
+        " image; arrows that agree with their neighbours mean that the lens model or the board is wrong.",
+        html.grid(
+            html.figure(
+                field, f"Corners over the image and their residuals, {magnify:g} times magnified.", 7
+            ),
+            html.figure(
+                plots.residual_scatter(result.residual_px, outlier), "Predicted minus seen corners.", 5
+            ),
+            html.figure(
+                plots.bars(result.view_rms_px, ~result.used, labels, "px", 1070),
+                "Residual of every view (rms); views in the second colour were left out.",
+                12,
+            ),
+            *_overlays(pictures, result.view, result.pixels, result.residual_px),
+        ),
+        html.tiles(
+            html.Tile("Reprojection", f"{result.rms_px:.3f} px", "rms, at mosaic resolution"),
+            html.Tile("Held-out reprojection", f"{result.held_out_px:.3f} px", "views not used for the fit"),
+            html.Tile(
+                "Focal length", f"{camera.K[0, 0]:.2f} px", f"sigma {sigma[0]:.2f} px, {relative:.3f} %"
+            ),
+            html.Tile(
+                "Coverage",
+                f"{100 * result.coverage:.0f} %",
+                "of an 8 x 6 grid over the image",
+                "plain" if result.coverage > 0.6 else "warn",
+            ),
+            html.Tile("Views", f"{result.used.sum()} of {len(result.used)}", _rejected(rejected)),
+        ),
+        html.table(["Parameter", "Value", "Standard deviation", "Unit"], rows),
+    )
+
+
+def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture]) -> str:
+    outlier = ~result.used[result.view]
+    width, height = result.board_size_m
+    corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]])
+    sketch = plots.pose_sketch(result.T_base_cam, result.T_base_board.apply(corners), result.used, "base")
+    labels = [str(i) for i in range(len(result.used))]
+    pose = result.T_tcp_cam.as_pose6()
+    sigma = np.sqrt(np.diagonal(result.covariance)[:6])
+    rows = [
+        [f"t {axis}", f"{1e3 * pose[i]:.3f} mm", f"{1e3 * sigma[i]:.3f} mm"] for i, axis in enumerate("xyz")
+    ]
+    rows += [
+        [f"r {axis}", f"{np.degrees(pose[3 + i]):.4f} deg", f"{np.degrees(sigma[3 + i]):.4f} deg"]
+        for i, axis in enumerate("xyz")
+    ]
+    methods = sorted(result.candidates_px.items(), key=lambda item: item[1])
+    spread = result.spread.rms_deg
+    return html.section(
+        "Hand-eye",
+        "The camera on the tool and the board in the arm's base frame, from stills. Residuals here take"
+        " the arm's"
+        " poses at their word, so they show the arm's repeatability as well as the camera's.",
+        html.grid(
+            html.figure(sketch, "Where the camera was, and the board, in the arm's base frame.", 7),
+            html.figure(
+                plots.residual_scatter(result.residual_px, outlier), "Predicted minus seen corners.", 5
+            ),
+            html.figure(
+                plots.bars(result.view_rms_px, ~result.used, labels, "px", 1070),
+                "Residual of every view (rms); views in the second colour were left out.",
+                12,
+            ),
+            *_overlays(pictures, result.view, result.pixels, result.residual_px),
+        ),
+        html.tiles(
+            html.Tile("Camera on the tool", f"± {1e3 * result.sigma_m:.3f} mm", "one sigma, all axes"),
+            html.Tile("Its rotation", f"± {np.degrees(result.sigma_rad):.4f}°", "one sigma, all axes"),
+            html.Tile(
+                "Held-out error",
+                f"{result.held_out_mm:.2f} mm",
+                f"{result.held_out_deg:.3f}°, median, board's pose",
+            ),
+            html.Tile(
+                "Arm's noise",
+                f"{1e3 * result.arm_sigma_m:.3f} mm",
+                f"{np.degrees(result.arm_sigma_rad):.4f}°, a coordinate; corners {result.pixel_sigma:.3f} px",
+            ),
+            html.Tile(
+                "Rotation spread",
+                f"{spread[0]:.0f}° / {spread[1]:.0f}° / {spread[2]:.0f}°",
+                "rms about the principal axes",
+                "good" if spread[1] > 8 else "warn",
+            ),
+            html.Tile(
+                "Board's size",
+                f"{100 * (result.board_scale - 1):+.3f} %",
+                f"against its description, ± {100 * result.board_scale_sigma:.3f} %",
+            ),
+            html.Tile(
+                "Views",
+                f"{result.used.sum()} of {len(result.used)}",
+                _rejected(np.flatnonzero(~result.used)),
+            ),
+        ),
+        html.table(["T_tcp_cam", "Value", "Standard deviation"], rows),
+        html.table(
+            ["Closed form", "Median corner error"], [[name, f"{error:.3f} px"] for name, error in methods]
+        ),
+    )
+
+
+def _time_offset(result: TimeOffsetResult) -> str:
+    order = np.argsort(result.speed_px_s)
+    labels = [f"{result.speed_px_s[i]:.0f}" for i in order]
+    apart = np.abs(1e3 * (result.frame_offset_s[order] - result.offset_s))
+    return html.section(
+        "Time offset",
+        "The board stands still, so the delay between camera and arm is the one that makes it stand still"
+        " in the"
+        " pictures. The curve must have one deep minimum.",
+        html.grid(
+            html.figure(
+                plots.curve(
+                    result.scan_s, result.scan_px, result.offset_s, "offset tried, s", "median error, px"
+                ),
+                "Corner error over the offset; the line marks the estimate.",
+                6,
+            ),
+            html.figure(
+                plots.bars(apart, ~result.used[order], labels, "ms"),
+                "How far each frame alone is from the estimate; frames by corner speed, px/s.",
+                6,
+            ),
+        ),
+        html.tiles(
+            html.Tile(
+                "Offset", f"{1e3 * result.offset_s:.2f} ms", f"sigma {1e3 * result.sigma_s:.3f} ms", "good"
+            ),
+            html.Tile("Corner error", f"{result.rms_px:.2f} px", f"{result.rms_before_px:.1f} px without it"),
+            html.Tile(
+                "Frames", str(int(result.used.sum())), f"{np.median(result.speed_px_s):.0f} px/s median"
+            ),
+        ),
+    )
+
+
+def _object(name: str, touched: TouchedObject) -> str:
+    result = touched.result
+    in_obj = result.T_base_obj.inverse().apply(touched.points_base)
+    sketch = plots.mesh_sketch(
+        np.asarray(touched.vertices, np.float64), np.asarray(touched.faces), in_obj, result.distance_m
+    )
+    count = len(result.distance_m)
+    sigma = np.sqrt(np.maximum(np.diagonal(result.covariance), 0))
+    angle = np.degrees(np.linalg.norm(sigma[3:]))
+    return html.section(
+        f"Object: {name}",
+        "Touched points on the mesh in its fitted pose; green lies within half a millimetre of the surface.",
+        *(html.note(f"The touched points do not determine the {words}.") for words in result.unobservable),
+        html.grid(
+            html.figure(sketch, "Touched points on the object.", 5),
+            html.figure(
+                plots.bars(
+                    np.abs(1e3 * result.distance_m),
+                    np.abs(result.distance_m) > 5e-4,
+                    [str(i) for i in range(count)],
+                    "mm",
+                    620,
+                ),
+                "Distance of every point from the surface.",
+                7,
+            ),
+        ),
+        html.tiles(
+            html.Tile("Fit", f"{1e3 * result.rms_m:.2f} mm", f"rms of {count} points"),
+            html.Tile("Position", f"± {1e3 * np.linalg.norm(sigma[:3]):.2f} mm", "one sigma, all axes"),
+            html.Tile("Rotation", f"± {angle:.2f}°", "one sigma, all axes", "warn" if angle > 3 else "plain"),
+            html.Tile(
+                "Next best pose",
+                f"{1e3 * result.runner_up_rms_m:.2f} mm" if np.isfinite(result.runner_up_rms_m) else "none",
+                "rms of the closest rival",
+                "warn" if result.runner_up_rms_m < 2 * result.rms_m else "good",
+            ),
+        ),
+    )
+
+
+def _overlays(
+    pictures: Sequence[ViewPicture],
+    view: NDArray[np.int64],
+    pixels: NDArray[np.float64],
+    residual_px: NDArray[np.float64],
+) -> list[str]:
+    drawn: list[str] = []
+    for shown in pictures:
+        corners = view == shown.view
+        intensity = intensity_image(shown.raw, shown.layout)
+        white = max(float(np.percentile(intensity, 99.5)), 1e-6)
+        grey = np.clip(255 * (intensity / white) ** (1 / 1.6), 0, 255).astype(np.uint8)
+        seen = pixels[corners]
+        drawn.append(
+            html.figure(
+                plots.overlay(grey, seen, seen + residual_px[corners], 2),
+                f"View {shown.view}: corners seen (rings) and predicted (crosses), on S0.",
+                6,
+            )
+        )
+    return drawn
+
+
+def _rejected(views: NDArray[np.intp]) -> str:
+    return "none left out" if len(views) == 0 else f"left out: {', '.join(map(str, views[:12]))}"

@@ -1,0 +1,68 @@
+"""The board's description: what it refuses, where its corners are, and that drawing and detection agree."""
+
+import numpy as np
+import pytest
+
+from calibration.board import BoardSpec, draw
+from calibration.detection import detect, explain_missing_board
+from dataset.errors import CalibrationError
+
+SPEC = BoardSpec(6, 5, 0.04, 0.03, "DICT_4X4_50")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ((2, 5, 0.04, 0.03, "DICT_4X4_50"), "at least 3 squares"),
+        ((6, 5, 0.04, 0.04, "DICT_4X4_50"), "smaller than square_m"),
+        ((6, 5, 40.0, 30.0, "DICT_4X4_50"), "metres"),
+        ((6, 5, 0.04, 0.03, "DICT_9X9"), "unknown dictionary"),
+        ((20, 20, 0.04, 0.03, "DICT_4X4_50"), "larger dictionary"),
+    ],
+)
+def test_an_impossible_board_is_refused_with_the_reason(arguments, reason):
+    with pytest.raises(CalibrationError, match=reason):
+        BoardSpec(*arguments)
+
+
+def test_corners_are_numbered_row_by_row():
+    points = SPEC.object_points(np.array([0, 1, 5]))
+    np.testing.assert_allclose(points, [[0.04, 0.04, 0], [0.08, 0.04, 0], [0.04, 0.08, 0]])
+
+
+def test_a_corner_of_another_board_is_refused():
+    with pytest.raises(CalibrationError, match="squares_x"):
+        SPEC.object_points(np.array([20]))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.uint16])
+def test_the_drawn_board_is_detected_where_it_was_drawn(dtype):
+    image = draw(SPEC, 60, margin_px=30)
+    scale = 200 if dtype == np.uint16 else 1
+    found = detect((image.astype(np.float64) * scale).astype(dtype), SPEC)
+    assert found is not None
+    assert len(found) == SPEC.corner_count
+    expected = 30 + SPEC.object_points(found.ids)[:, :2] / SPEC.square_m * 60 - 0.5
+    assert np.abs(found.pixels - expected).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("spec", "flip", "reason"),
+    [
+        (BoardSpec(6, 5, 0.04, 0.03, "DICT_6X6_50"), False, "DICT_4X4_"),
+        (BoardSpec(4, 5, 0.04, 0.03, "DICT_4X4_50"), False, "squares_x or squares_y is too small"),
+        (BoardSpec(7, 6, 0.04, 0.03, "DICT_4X4_50"), False, "do not lie as on"),
+        (SPEC, True, "mirrored"),
+    ],
+)
+def test_a_wrong_description_is_explained(spec, flip, reason):
+    image = draw(SPEC, 60, margin_px=30)
+    image = np.ascontiguousarray(image[:, ::-1]) if flip else image
+    assert detect(image, spec) is None
+    assert reason in explain_missing_board(image, spec)
+
+
+def test_an_empty_picture_has_no_board():
+    image = np.full((300, 400), 120, np.uint8)
+    assert detect(image, SPEC) is None
+    assert "no marker" in explain_missing_board(image, SPEC)

@@ -1,0 +1,82 @@
+"""Intrinsics from analytic corners with noise: accuracy, honest error bars, outliers, refusals."""
+
+import numpy as np
+import pytest
+
+from calibration.detection import Detection
+from calibration.intrinsics import calibrate_intrinsics
+from dataset.errors import CalibrationError
+from dataset.transforms import SE3
+
+SIZE = (2048, 2448)
+
+
+def _views(world, seed, count=15, noise=0.1, tilt=0.3):
+    rng = np.random.default_rng(seed)
+    return [world.detection(pose, rng, noise) for pose in world.views(count, rng, tilt)]
+
+
+def test_the_camera_is_recovered_within_its_error_bars(world):
+    truth = np.concatenate([world.intrinsics.K[[0, 1, 0, 1], [0, 1, 2, 2]], world.intrinsics.distortion])
+    scores = []
+    for seed in range(6):
+        result = calibrate_intrinsics(_views(world, seed), world.spec, SIZE)
+        found = np.concatenate(
+            [result.intrinsics.K[[0, 1, 0, 1], [0, 1, 2, 2]], result.intrinsics.distortion]
+        )
+        assert abs(found[0] / truth[0] - 1) < 2e-3
+        assert result.rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+        assert result.rms_px <= result.held_out_px * 1.02 < 0.16
+        scores.append((found - truth) / result.sigma)
+    assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.6
+
+
+@pytest.mark.parametrize("count", [0, 4, 5, 8])
+def test_every_distortion_model_of_opencv_can_be_estimated(world, count):
+    result = calibrate_intrinsics(_views(world, 1), world.spec, SIZE, distortion_count=count)
+    assert len(result.intrinsics.distortion) == count
+    assert result.covariance.shape == (4 + count, 4 + count)
+
+
+def test_a_blurred_view_is_left_out_and_named(world):
+    detections = _views(world, 2)
+    rng = np.random.default_rng(0)
+    bad = detections[4]
+    detections[4] = Detection(bad.ids, bad.pixels + rng.normal(0, 3.0, bad.pixels.shape))
+    result = calibrate_intrinsics(detections, world.spec, SIZE)
+    assert list(np.flatnonzero(~result.used)) == [4]
+    assert abs(result.intrinsics.K[0, 0] / world.intrinsics.K[0, 0] - 1) < 2e-3
+
+
+def test_a_few_misplaced_corners_do_not_pull(world):
+    detections = _views(world, 3)
+    for detection in detections[::3]:
+        detection.pixels[7] += [6.0, -4.0]
+    result = calibrate_intrinsics(detections, world.spec, SIZE)
+    assert abs(result.intrinsics.K[0, 0] / world.intrinsics.K[0, 0] - 1) < 2e-3
+
+
+def test_too_few_views_are_refused(world):
+    with pytest.raises(CalibrationError, match="4 views show the board; at least 5"):
+        calibrate_intrinsics(_views(world, 0, count=4), world.spec, SIZE)
+
+
+def test_the_same_view_repeated_is_refused(world):
+    rng = np.random.default_rng(0)
+    pose = world.views(1, rng)[0]
+    detections = [world.detection(pose, rng) for _ in range(20)]
+    with pytest.raises(CalibrationError, match="only 1 of 20 views differ"):
+        calibrate_intrinsics(detections, world.spec, SIZE)
+
+
+def test_a_board_that_was_never_tilted_is_refused(world):
+    rng = np.random.default_rng(0)
+    centre = [-0.12, -0.165, 0.0]
+    poses = [SE3.from_rotvec(np.zeros(3), np.add(centre, [0.01 * i, 0, 0.4 + 0.03 * i])) for i in range(9)]
+    with pytest.raises(CalibrationError, match="tilt"):
+        calibrate_intrinsics([world.detection(pose, rng) for pose in poses], world.spec, SIZE)
+
+
+def test_views_of_another_resolution_are_refused(world):
+    with pytest.raises(CalibrationError, match="outside a 1224x1024 image"):
+        calibrate_intrinsics(_views(world, 0), world.spec, (1024, 1224))

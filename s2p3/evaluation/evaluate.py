@@ -10,6 +10,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from s2p3.evaluation.metrics import Summary
 from s2p3.evaluation.predict import Estimator, Finder
 from s2p3.networks.detector import Detection
 from s2p3.objects import ObjectModel
-from s2p3.training.progress import OnStep, progress_bar
+from s2p3.training.progress import OnStep, reporting
 
 MINIMUM_VISIBLE = 0.1
 """Share of the silhouette from which a frame is a target, as in the BOP challenge."""
@@ -67,6 +68,19 @@ class Evaluation:
         text = json.dumps({"summary": asdict(self.summary), "records": rows}, indent=1)
         path.write_text(text, encoding="utf-8")
 
+    @staticmethod
+    def load(path: Path) -> Evaluation:
+        """Reads what `save` wrote.
+
+        Raises ToolkitError: no such file, or not an evaluation.
+        """
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            summary = Summary(**content["summary"])
+            return Evaluation(summary, tuple(_record_from(row) for row in content["records"]))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ToolkitError(f"{path} is not a saved evaluation ({error}); run `s2p3 evaluate` again") from error
+
 
 def find_objects(
     session: Session, indices: Sequence[int], detector: Path, object_name: str, on_step: OnStep | None = None
@@ -77,10 +91,10 @@ def find_objects(
     """
     find = Finder.load(detector, object_name)
     found = []
-    with progress_bar("detection", len(indices)) as bar:
+    with reporting("detection", len(indices), on_step) as report:
         for count, index in enumerate(indices, start=1):
             found.append(find(session.stokes(index).stack()))
-            (on_step or bar)(count, len(indices), {})
+            report(count, len(indices), {})
     return found
 
 
@@ -113,7 +127,7 @@ def evaluate(
             f"{session.path}: none of the {len(indices)} frames shows {model.name!r}; choose another split"
         )
     records = []
-    with progress_bar("evaluation", len(targets)) as bar:
+    with reporting("evaluation", len(targets), on_step) as report:
         for count, position in enumerate(targets, start=1):
             index = int(indices[position])
             stokes = session.stokes(index).stack()
@@ -123,7 +137,7 @@ def evaluate(
             pose = None if found is None else found.T_cam_obj
             box = None if found is None else found.detection.box_xywh
             records.append(_record(index, visible, box, pose, poses.T_cam_obj[index], points, model))
-            (on_step or bar)(count, len(targets), {})
+            report(count, len(targets), {})
     return Evaluation(summarize(records, model), tuple(records))
 
 
@@ -177,6 +191,14 @@ def _record(
         translation_mm=float(np.linalg.norm(offset)),
         depth_mm=float(offset[2]),
     )
+
+
+def _record_from(row: dict[str, Any]) -> Record:
+    """A record as `Evaluation.save` wrote it; null stands for what was not finite."""
+    numbers = {name: float("nan") for name in ("rotation_deg", "translation_mm", "depth_mm") if row[name] is None}
+    if row["error_m"] is None:
+        numbers["error_m"] = float("inf")
+    return Record(**{**row, **numbers})
 
 
 def _finite(value: object) -> object:

@@ -27,7 +27,7 @@ from s2p3.networks.detector import Detection
 from s2p3.objects import ObjectModel, Symmetry
 from s2p3.rendering import rasterize
 from s2p3.training.checkpoint import save_tensors
-from s2p3.training.progress import OnStep, progress_bar
+from s2p3.training.progress import OnStep, reporting
 
 _MINIMUM_VISIBLE = 0.3  # our choice: frames that show less of the object than this are not trained on
 
@@ -97,8 +97,7 @@ def labelled_crops(
     if stored is not None and stored.exists():
         return LabelledCrops(**load_file(stored))
     rows: list[dict[str, NDArray[np.generic]]] = []
-    with progress_bar(f"crops of {model.name}", 1) as bar:
-        report = on_step or bar
+    with reporting(f"crops of {model.name}", 1, on_step) as report:
         for path in paths:
             with Session.open(path) as session:
                 intrinsics = session.working_intrinsics

@@ -23,7 +23,7 @@ from s2p3.training import checkpoint
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import fingerprint
 from s2p3.training.loop import LoopConfig, Losses, optimize, sample_indices
-from s2p3.training.progress import OnStep, progress_bar
+from s2p3.training.progress import OnStep, reporting
 
 # Ranges of the augmentation, our choice: wide, because the captured domain is not known.
 _SCALE = (0.75, 1.35)
@@ -58,8 +58,7 @@ def small_frames(
 ) -> SmallFrames:
     """Every frame of `paths`, down-sampled by `level`, with the object's visible mask as the only class."""
     stokes, masks = [], []
-    with progress_bar(f"frames with {object_name}", 1) as bar:
-        report = on_step or bar
+    with reporting(f"frames with {object_name}", 1, on_step) as report:
         for path in paths:
             with Session.open(path) as session:
                 poses = session.object_poses(object_name)

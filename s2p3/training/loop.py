@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
 from s2p3.training.checkpoint import save_tensors
-from s2p3.training.progress import OnStep, progress_bar
+from s2p3.training.progress import OnStep, reporting
 
 Losses = dict[str, Tensor]
 LossAt = Callable[[torch.Generator], Losses]
@@ -84,7 +84,7 @@ def optimize(
     _truncate(log_path, first)
     skipped = 0
     started = time.perf_counter()
-    with progress_bar(label, config.steps, first) if on_step is None else _calling(on_step) as report:
+    with reporting(label, config.steps, on_step) as report:
         for step in range(first, config.steps):
             for group in optimizer.param_groups:
                 group["lr"] = config.learning_rate * rate_factor(config.schedule, step / config.steps)
@@ -146,19 +146,6 @@ def sample_indices(samples: int, batch: int, generator: torch.Generator) -> Tens
     return torch.randint(0, samples, (batch,), generator=generator)
 
 
-class _calling:
-    """A context that yields the caller's own report function."""
-
-    def __init__(self, on_step: OnStep) -> None:
-        self._on_step = on_step
-
-    def __enter__(self) -> OnStep:
-        return self._on_step
-
-    def __exit__(self, *_: object) -> None:
-        return None
-
-
 def _store(
     path: Path, run: str, step: int, network: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer
 ) -> None:
@@ -186,8 +173,11 @@ def _restore(
     network.load_state_dict(parts["network"])
     average.load_state_dict(parts["average"])
     states: dict[int, dict[str, Tensor]] = {}
+    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     for name, value in parts["optimizer"].items():
         index, field = name.split(".")
+        if value.dim() > 0:  # the fused kernel walks weight and moments side by side: same memory layout
+            value = torch.empty_like(weights[int(index)]).copy_(value)
         states.setdefault(int(index), {})[field] = value
     optimizer.load_state_dict({**optimizer.state_dict(), "state": states})
     return int(metadata["step"])

@@ -19,7 +19,17 @@ OnStep = Callable[[int, int, dict[str, float]], None]
 
 
 @contextmanager
-def progress_bar(label: str, total: int, done: int = 0) -> Iterator[OnStep]:
+def reporting(label: str, total: int, on_step: OnStep | None = None) -> Iterator[OnStep]:
+    """Yields the caller's `on_step`, or without one the function that moves a new progress bar."""
+    if on_step is not None:
+        yield on_step
+        return
+    with progress_bar(label, total) as report:
+        yield report
+
+
+@contextmanager
+def progress_bar(label: str, total: int) -> Iterator[OnStep]:
     """A rich progress bar; yields the function that moves it."""
     columns = (
         TextColumn("{task.description}"),
@@ -30,7 +40,7 @@ def progress_bar(label: str, total: int, done: int = 0) -> Iterator[OnStep]:
         TextColumn("{task.fields[values]}"),
     )
     with Progress(*columns) as bar:
-        task = bar.add_task(label, total=total, completed=done, values="")
+        task = bar.add_task(label, total=total, values="")
 
         def report(step: int, steps: int, values: dict[str, float]) -> None:
             shown = f"loss {values['total']:.3f}" if "total" in values else ""

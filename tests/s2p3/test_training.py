@@ -1,0 +1,324 @@
+"""Trainings for real, on eight small frames: losses fall, resuming changes nothing, no pose leaks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from dataclasses import fields
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from dataset import SE3
+from dataset.errors import ToolkitError
+from dataset.session import Session
+from s2p3 import config as presets
+from s2p3.config import AugmentationConfig, ExperimentConfig
+from s2p3.inputs import View
+from s2p3.networks.detector import Detection
+from s2p3.networks.teacher import Teacher
+from s2p3.objects import ObjectModel, Symmetry, build
+from s2p3.training import (
+    Crops,
+    LabelledCrops,
+    captured_crops,
+    checkpoint,
+    labelled_crops,
+    loop,
+    self_supervise,
+    train_detector,
+    train_student,
+    train_teacher,
+)
+from s2p3.training.batches import form_input, form_targets
+from s2p3.training.crops import canonical_pose, mask_box
+from s2p3.training.detection import box_distances, detector_losses
+from s2p3.training.pretrain import load_student, load_teacher
+from s2p3.training.pseudo_labels import carry_labels, make_labels
+
+
+def tiny() -> ExperimentConfig:
+    base = presets.quick()
+    pretrain = dataclasses.replace(base.teacher, steps=24, batch=4, checkpoint_every=10, learning_rate=2e-3)
+    still = AugmentationConfig(1.4, 1.4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return dataclasses.replace(
+        base,
+        augmentation=still,
+        detector=dataclasses.replace(base.detector, steps=30, batch=4),
+        teacher=pretrain,
+        student=pretrain,
+        self_supervision=dataclasses.replace(base.self_supervision, steps=4, batch=4, adapt_batches=1),
+    )
+
+
+def silent(step: int, steps: int, values: dict[str, float]) -> None:
+    del step, steps, values
+
+
+@pytest.fixture(scope="module")
+def crops(cup_session: Path, cup: ObjectModel) -> LabelledCrops:
+    return labelled_crops([cup_session], cup, tiny().input, on_step=silent)
+
+
+@pytest.fixture(scope="module")
+def trained(cup_session: Path, cup: ObjectModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with teacher and student of 24 steps, and their logs."""
+    out = tmp_path_factory.mktemp("trained")
+    train_teacher([cup_session], cup, tiny(), out, on_step=silent)
+    train_student([cup_session], cup, tiny(), out, on_step=silent)
+    return out
+
+
+def log_of(path: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_crops_show_the_object_where_their_pose_says(crops: LabelledCrops, cup: ObjectModel) -> None:
+    assert len(crops) == 8
+    covered = crops.normals.norm(dim=1) > 0.5
+    seen = crops.mask[:, 0] > 0.5
+    overlap = (covered & seen).sum((1, 2)) / (covered | seen).sum((1, 2))
+    assert overlap.min() > 0.93
+    assert (crops.coordinates.abs() <= 1.001).all()
+    points = torch.from_numpy(cup.surface_points(50)).float()
+    placed = points @ crops.rotation.transpose(1, 2) + crops.translation[:, None]
+    pixels = (placed @ crops.K.transpose(1, 2))[..., :2] / placed[..., 2:]
+    assert ((pixels > 0) & (pixels < 95)).all()
+
+
+def test_crops_are_kept_for_the_next_call(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
+    first = labelled_crops([cup_session], cup, tiny().input, tmp_path, silent)
+    (stored,) = tmp_path.iterdir()
+    before = stored.stat().st_mtime_ns
+    second = labelled_crops([cup_session], cup, tiny().input, tmp_path, silent)
+    assert stored.stat().st_mtime_ns == before
+    for field in fields(LabelledCrops):
+        assert torch.equal(getattr(first, field.name), getattr(second, field.name))
+
+
+def test_targets_of_a_turned_view_agree_with_its_pose(crops: LabelledCrops, cup: ObjectModel) -> None:
+    """The coordinates under a pixel, placed by the turned pose, project back onto that pixel."""
+    experiment = tiny()
+    view = View(torch.full((8,), 1.4), torch.full((8, 2), 0.05), torch.full((8,), 0.5))
+    targets = form_targets(crops, torch.arange(8), view, experiment)
+    K = form_input(crops, torch.arange(8), view, 1.5, experiment).K
+    lower, extent = torch.from_numpy(cup.mesh.lower), torch.from_numpy(cup.mesh.extent)
+    points = lower[:, None, None] + extent[:, None, None] * (targets.coordinates + 1) / 2
+    placed = torch.einsum("bij,bjhw->bihw", targets.rotation, points) + targets.translation[:, :, None, None]
+    projected = torch.einsum("bij,bjhw->bihw", K, placed)
+    projected = projected[:, :2] / projected[:, 2:]
+    steps = 4 * torch.arange(16) + 1.5
+    wanted = torch.stack(torch.meshgrid(steps, steps, indexing="xy"))
+    inside = targets.coordinates.abs().sum(1) > 0
+    error = (projected - wanted).norm(dim=1)[inside]
+    assert error.median() < 0.7
+
+
+def test_a_symmetry_axis_leaves_one_pose(cup: ObjectModel) -> None:
+    symmetry = Symmetry(axis=np.array([0.0, 0.0, 1.0]))
+    pose = SE3.from_rotvec(np.array([1.8, 0.2, 0.1]), np.array([0.05, 0.0, 0.5]))
+    turned = pose @ SE3.from_rotvec(np.array([0.0, 0.0, 1.234]), np.zeros(3))
+    first, second = canonical_pose(pose, symmetry), canonical_pose(turned, symmetry)
+    np.testing.assert_allclose(first.as_matrix(), second.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(first.rotation[:, 2], pose.rotation[:, 2], atol=1e-9)
+    assert canonical_pose(pose, cup.symmetry) is pose
+
+
+def test_teacher_and_student_learn(trained: Path) -> None:
+    for name in ("teacher", "student"):
+        log = log_of(trained / f"{name}.log.jsonl")
+        assert [line["step"] for line in log] == [10, 20, 24]
+        assert log[-1]["total"] < 0.75 * log[0]["total"]
+
+
+def test_checkpoints_say_what_they_are(trained: Path, cup: ObjectModel) -> None:
+    network, info = load_teacher(trained / "teacher.safetensors", "cup")
+    assert isinstance(network, Teacher)
+    assert not network.training
+    assert (info.kind, info.stage, info.object_name, info.step) == ("teacher", "pretrained", "cup", 24)
+    assert info.config == tiny()
+    assert info.diameter_m == cup.diameter
+    with pytest.raises(ToolkitError, match=r"'cup', not 'fork'"):
+        load_student(trained / "student.safetensors", "fork")
+    with pytest.raises(ToolkitError, match="holds a teacher, not a student"):
+        load_student(trained / "teacher.safetensors")
+    with pytest.raises(ToolkitError, match="no such file"):
+        load_student(trained / "nothing.safetensors")
+
+
+def test_weights_of_another_network_are_refused(trained: Path, tmp_path: Path) -> None:
+    shutil.copy(trained / "student.safetensors", tmp_path / "teacher.safetensors")
+    shutil.copy(trained / "teacher.json", tmp_path / "teacher.json")
+    with pytest.raises(ToolkitError, match="does not fit"):
+        load_teacher(tmp_path / "teacher.safetensors")
+
+
+def test_a_stopped_training_resumes_exactly(
+    trained: Path, cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    def stop(step: int, steps: int, values: dict[str, float]) -> None:
+        del steps, values
+        if step == 17:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_student([cup_session], cup, tiny(), tmp_path, on_step=stop)
+    assert (tmp_path / "student.resume.safetensors").exists()
+    resumed_from = []
+    train_student([cup_session], cup, tiny(), tmp_path, on_step=lambda step, *_: resumed_from.append(step))
+    assert resumed_from[0] == 11
+    whole, resumed = log_of(trained / "student.log.jsonl"), log_of(tmp_path / "student.log.jsonl")
+    assert [line["total"] for line in whole] == [line["total"] for line in resumed]
+    a, b = (load_file(folder / "student.safetensors") for folder in (trained, tmp_path))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert not (tmp_path / "student.resume.safetensors").exists()
+
+
+def test_a_resume_file_of_other_settings_is_refused(
+    cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    def stop(step: int, steps: int, values: dict[str, float]) -> None:
+        del steps, values
+        if step == 3:
+            raise KeyboardInterrupt
+
+    experiment = dataclasses.replace(tiny(), student=dataclasses.replace(tiny().student, checkpoint_every=2))
+    with pytest.raises(KeyboardInterrupt):
+        train_student([cup_session], cup, experiment, tmp_path, on_step=stop)
+    other = dataclasses.replace(experiment, student=dataclasses.replace(experiment.student, seed=1))
+    with pytest.raises(ToolkitError, match="other settings"):
+        train_student([cup_session], cup, other, tmp_path, on_step=silent)
+
+
+def test_a_loss_that_is_never_finite_stops_the_training(tmp_path: Path) -> None:
+    settings = loop.LoopConfig(100, 1e-3, "cosine", 0.0, 1.0, 0.9, 0, 50)
+    layer = torch.nn.Linear(2, 1)
+    with pytest.raises(ToolkitError, match="not finite"):
+        loop.optimize(
+            layer,
+            lambda _: {"total": layer(torch.ones(1, 2)).sum() * float("nan")},
+            settings,
+            tmp_path / "x.safetensors",
+            "",
+            "test",
+            silent,
+        )
+
+
+def test_learning_rates() -> None:
+    assert loop.rate_factor("halving", 0.0) == 1
+    assert loop.rate_factor("halving", 0.26) == 0.5
+    assert loop.rate_factor("halving", 0.99) == 0.125
+    assert loop.rate_factor("cosine", 0.08) == 1
+    assert loop.rate_factor("cosine", 0.0) < 0.05
+    assert loop.rate_factor("cosine", 0.999) < 0.01
+    assert loop.steps_of(7, 0, 8, 100) == 7
+    assert loop.steps_of(7, 3, 8, 100) == 36
+
+
+def test_a_warm_start_takes_the_teachers_encoders(
+    trained: Path, cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    student = dataclasses.replace(tiny().student, warm_start=True, steps=1, learning_rate=0.0, ema=0.0)
+    experiment = dataclasses.replace(tiny(), student=student)
+    with pytest.raises(ToolkitError, match="warm_start"):
+        train_student([cup_session], cup, experiment, tmp_path, on_step=silent)
+    teacher = trained / "teacher.safetensors"
+    path = train_student([cup_session], cup, experiment, tmp_path, teacher=teacher, on_step=silent)
+    wanted, found = load_file(teacher), load_file(path)
+    stem = "encoder.polarization.stem.0.weight"
+    assert torch.equal(wanted[stem], found[stem])
+
+
+def test_the_detector_learns(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
+    train_detector([cup_session], cup, tiny(), tmp_path, on_step=silent)
+    log = log_of(tmp_path / "detector.log.jsonl")
+    assert log[-1]["total"] < 0.8 * log[0]["total"]
+
+
+def test_box_distances_by_hand() -> None:
+    mask = torch.zeros(1, 8, 10, dtype=torch.bool)
+    mask[0, 2:6, 3:9] = True
+    distances, side = box_distances(mask, (4, 5))
+    assert side.tolist() == [6]
+    # the cell in row 1, column 2 has its centre at x = 5, y = 3
+    assert distances[0, :, 1, 2].tolist() == [2, 1, 4, 3]
+    perfect = detector_losses(
+        torch.where(mask[:, None, ::2, ::2], 20.0, -20.0), distances, torch.ones(1, 1, 8, 10) * mask[:, None]
+    )
+    assert perfect["box"] == 0
+
+
+def detections(session: Session, cup: ObjectModel) -> list[Detection | None]:
+    masks = [session.object_poses(cup.name).mask(index) for index in range(len(session))]
+    found: list[Detection | None] = [Detection(mask_box(mask), mask, 0.9) for mask in masks]
+    found[3] = None
+    return found
+
+
+def test_captured_crops_hold_no_pose() -> None:
+    assert {field.name for field in fields(Crops)} == {"stokes", "mask", "K", "frames"}
+
+
+def test_carried_labels_match_labels_made_on_the_same_view(
+    crops: LabelledCrops, trained: Path, cup: ObjectModel
+) -> None:
+    experiment = tiny()
+    teacher, _ = load_teacher(trained / "teacher.safetensors")
+    labels = make_labels(teacher, crops, cup, experiment, experiment.self_supervision)
+    view = View.centred(8, experiment.input.zoom)
+    same = carry_labels(labels, crops, torch.arange(8), view, experiment)
+    torch.testing.assert_close(same.mask, labels.mask, atol=1e-4, rtol=0)
+    torch.testing.assert_close(same.rotation, labels.rotation)
+    assert ((labels.delta >= 0) & (labels.delta <= 1)).all()
+    share = (labels.delta <= labels.threshold).float().mean()
+    assert 0 < share < 0.5
+
+
+def test_self_supervision_cannot_see_captured_poses(
+    trained: Path, cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    """The same weights to the last bit, whether the file holds poses or not."""
+    blind = tmp_path / "blind.h5"
+    shutil.copy(cup_session, blind)
+    with Session.open(cup_session) as session:
+        found = detections(session, cup)
+    with h5py.File(blind, "r+") as file:
+        del file["poses"]
+    networks = (trained / "teacher.safetensors", trained / "student.safetensors")
+    weights = []
+    for path in (cup_session, blind):
+        with Session.open(path) as session:
+            crops = captured_crops(session, range(8), found, tiny().input)
+        out = self_supervise(crops, cup, *networks, tmp_path / path.stem, on_step=silent)
+        weights.append(load_file(out))
+    assert len(crops) == 7
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+    before = load_file(networks[1])
+    assert any(not torch.equal(before[name], weights[0][name]) for name in before)
+    info = checkpoint.read_info(tmp_path / "blind" / "adapted.safetensors", "student", "cup")
+    assert info.stage == "self-supervised"
+
+
+def test_self_supervision_refuses_another_objects_networks(
+    trained: Path, crops: LabelledCrops, tmp_path: Path
+) -> None:
+    with pytest.raises(ToolkitError, match="not 'fork'"):
+        self_supervise(
+            crops, build("fork"), trained / "teacher.safetensors", trained / "student.safetensors", tmp_path
+        )
+
+
+def test_nothing_detected_is_said_clearly(cup_session: Path) -> None:
+    with Session.open(cup_session) as session, pytest.raises(ToolkitError, match="none of the frames"):
+        captured_crops(session, [0, 1], [None, None], tiny().input)
+
+
+def test_an_object_the_session_lacks_is_said_clearly(cup_session: Path) -> None:
+    with pytest.raises(ToolkitError, match="knife"):
+        labelled_crops([cup_session], build("knife"), tiny().input, on_step=silent)

@@ -23,7 +23,7 @@ JOINT_SPEED_LIMIT = np.pi  # rad/s
 
 _COS_ALPHA = np.round(np.cos(DH_ALPHA))
 _SIN_ALPHA = np.round(np.sin(DH_ALPHA))
-_SINGULAR = 1e-9  # |sin q5| under which joints 4 and 6 turn about one line and only their sum is determined
+_SINGULAR = 1e-6  # |sin q5| under which joints 4 and 6 turn about one line and only their sum is determined
 
 
 def link_transforms(q: ArrayLike) -> Floats:
@@ -159,4 +159,4 @@ def _wrist_1_in_shoulder(
 
 def _arccos(value: Floats) -> Floats:
     """arccos that forgives rounding at the edge of the workspace; NaN beyond it."""
-    return np.asarray(np.arccos(np.where(np.abs(value) > 1 + 1e-9, np.nan, np.clip(value, -1, 1))))
+    return np.asarray(np.arccos(np.where(np.abs(value) > 1 + 1e-7, np.nan, np.clip(value, -1, 1))))

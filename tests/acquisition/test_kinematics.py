@@ -46,7 +46,7 @@ def test_batches_agree_with_single_calls() -> None:
 @settings(max_examples=60, deadline=None)
 def test_every_inverse_solution_reaches_the_pose(q: np.ndarray) -> None:
     target = forward(q)
-    solutions = inverse_all(target)
+    solutions = inverse_all(target, free_wrist_3=q[5])
     solutions = solutions[np.isfinite(solutions).all(axis=-1)]
     assert len(solutions) >= 1
     reached = forward(solutions)

@@ -159,21 +159,29 @@ class Intrinsics:
         commonly used stalls (strong distortion towards the corners)."""
         if not self.distortion.any():
             return target
-        plane, step = target.copy(), 1e-6
+        plane = target.copy()
         for _ in range(_NEWTON_STEPS):
             residual = self._distort(plane) - target
-            if np.all((np.abs(residual) < _NEWTON_TOLERANCE) | np.isnan(target)):
-                return plane
-            columns = [
-                (self._distort(plane + offset) - self._distort(plane - offset)) / (2 * step)
-                for offset in (np.array([step, 0.0]), np.array([0.0, step]))
-            ]
-            (a, c), (b, d) = np.moveaxis(columns[0], -1, 0), np.moveaxis(columns[1], -1, 0)
-            u, v = residual[..., 0], residual[..., 1]
+            (a, c), (b, d) = self._jacobian(plane)
             determinant = a * d - b * c
+            if np.all((np.abs(residual) < _NEWTON_TOLERANCE).all(axis=-1) | np.isnan(target).any(axis=-1)):
+                folded = (determinant <= 0) | (a + d <= 0)
+                if folded.any():
+                    break
+                return plane
+            u, v = residual[..., 0], residual[..., 1]
             plane = plane - np.stack([d * u - b * v, a * v - c * u], axis=-1) / determinant[..., None]
         raise CalibrationError(
             "Intrinsics.rays: the distortion model cannot be inverted at some pixel "
             f"(coefficients {np.round(self.distortion, 4).tolist()}); recalibrate with fewer coefficients or "
             "with views that reach the image corners"
         )
+
+    def _jacobian(self, plane: Floats) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+        """Central differences of `_distort`: ((dx'/dx, dy'/dx), (dx'/dy, dy'/dy)). The model is turned inside
+        out where the determinant or the trace is not positive."""
+        step = 1e-6
+        x, y = np.array([step, 0.0]), np.array([0.0, step])
+        by_x = (self._distort(plane + x) - self._distort(plane - x)) / (2 * step)
+        by_y = (self._distort(plane + y) - self._distort(plane - y)) / (2 * step)
+        return (by_x[..., 0], by_x[..., 1]), (by_y[..., 0], by_y[..., 1])

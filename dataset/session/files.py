@@ -21,9 +21,14 @@ from numpy.typing import ArrayLike
 from dataset.compression import filter_options
 from dataset.errors import SessionError
 from dataset.schema import DROP_DTYPE, FORMAT, MAJOR, VERSION, Dataset
+from dataset.session.superblock import HealedFile
 
 LIBVER = ("v110", "v110")
 """File format of HDF5 1.10: the oldest with single-writer-multiple-readers, readable by everything since."""
+
+
+READ_ERRORS = (OSError, RuntimeError, KeyError, ValueError)
+"""What h5py raises, depending on the place, when bytes in the file do not make sense."""
 
 
 def create(path: Path) -> h5py.File:
@@ -69,13 +74,26 @@ def open_hdf5(path: Path) -> tuple[h5py.File, bool]:
     except OSError as error:
         if "already open for write" not in str(error):
             raise _explained(path, error) from error
-        try:
-            return h5py.File(path, "r", libver=LIBVER, swmr=True), True
-        except OSError as swmr_error:
-            raise SessionError(
-                f"{path} is being changed by another program, or one was killed while changing it; "
-                f"close that program, or run: s2p3 dataset repair {path}"
-            ) from swmr_error
+    if not in_use(path):
+        return open_healed(path), True
+    try:
+        return h5py.File(path, "r", libver=LIBVER, swmr=True), True
+    except OSError as error:
+        raise SessionError(f"{path} is being changed by another program; wait for it or close it") from error
+
+
+def open_healed(path: Path) -> h5py.File:
+    """Opens what a killed writer, a full disk or a short copy left; parts of it may not be readable.
+
+    Raises:
+        SessionError: not even the table of contents can be read.
+    """
+    try:
+        return h5py.File(HealedFile(path), "r")
+    except OSError as error:
+        raise SessionError(
+            f"{path} is damaged beyond repair ({str(error).splitlines()[0]}); use a copy of it"
+        ) from error
 
 
 @contextmanager
@@ -132,13 +150,13 @@ def check_format(path: Path, file: h5py.File) -> None:
     Raises:
         SessionError: with what was found.
     """
-    found = attribute(file, "format")
+    with reading(path):
+        found, version = attribute(file, "format"), str(attribute(file, "schema"))
     if found != FORMAT:
         raise SessionError(
             f"{path} is HDF5 but no session: its format attribute is {found!r}, expected {FORMAT!r}; "
             "convert it with: s2p3 dataset import"
         )
-    version = str(attribute(file, "schema"))
     major = version.split(".")[0]
     if not major.isdigit():
         raise SessionError(f"{path}: the schema version {version!r} is not MAJOR.MINOR; the file is damaged")
@@ -146,6 +164,18 @@ def check_format(path: Path, file: h5py.File) -> None:
         raise SessionError(
             f"{path} has schema {version}, this toolkit reads up to {VERSION}; upgrade the toolkit to open it"
         )
+
+
+@contextmanager
+def reading(path: Path, part: str = "its table of contents") -> Iterator[None]:
+    """Turns what h5py raises on damaged bytes into a `SessionError` that says what to do."""
+    try:
+        yield
+    except READ_ERRORS as error:
+        raise SessionError(
+            f"{path}: {part} is damaged ({str(error).splitlines()[0]}); copy the file again from its "
+            f"source, or save what is left with: s2p3 dataset repair {path}"
+        ) from error
 
 
 def attribute(node: h5py.Group, name: str) -> Any:

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +17,8 @@ from dataset.frames import SUPERPIXEL, CameraInfo, ClockFit, RobotTrace
 from dataset.intrinsics import Intrinsics
 from dataset.polarimetry import Raw, Stokes, decode, remap
 from dataset.schema import CAMERA_ATTRIBUTES, FRAME_COLUMNS, ROBOT_COLUMNS
-from dataset.session.files import attribute, open_for_reading
+from dataset.session.contents import Contents, StoredMasks
+from dataset.session.files import open_for_reading
 from dataset.session.records import Clocks, ObjectPoses, ObjectRecord
 from dataset.transforms import SE3
 
@@ -29,20 +29,25 @@ class Session:
     Sending it to another process sends the path: each process opens the file for itself.
     Everything derived (Stokes images, boxes, masks, T_cam_obj) lives in the undistorted image of
     `working_intrinsics`; raw mosaics are as the camera sent them.
+
+    Attributes:
+        path: of the file.
+        contents: everything in the file by its path, for what has no property here.
+        kind, session_id, rig_toml: as stored.
+        complete: whether the recording ended as intended.
+        camera: its description.
     """
 
-    def __init__(self, path: Path, file: h5py.File, unfinished: bool) -> None:
+    def __init__(self, path: Path, contents: Contents, unfinished: bool) -> None:
         self.path = path
-        self._file = file
+        self.contents = contents
         self._object_poses: dict[str, ObjectPoses] = {}
-        self.complete = bool(attribute(file, "complete")) and not unfinished
-        self.kind = str(attribute(file, "kind"))
-        self.session_id = str(attribute(file, "session_id"))
-        self.rig_toml = str(attribute(file, "rig_toml"))
-        self._count = min(
-            self._dataset(f"camera/{name}").shape[0] for name in ("raw", "crc32", *FRAME_COLUMNS)
-        )
-        found = {a.name: attribute(file["camera"], a.name) for a in CAMERA_ATTRIBUTES}
+        self.complete = bool(contents.attribute("/", "complete")) and not unfinished
+        self.kind = str(contents.attribute("/", "kind"))
+        self.session_id = str(contents.attribute("/", "session_id"))
+        self.rig_toml = str(contents.attribute("/", "rig_toml"))
+        self._count = min(contents.length(f"camera/{name}") for name in ("raw", "crc32", *FRAME_COLUMNS))
+        found = {a.name: contents.attribute("camera", a.name) for a in CAMERA_ATTRIBUTES}
         missing = [name for name, value in found.items() if value is None]
         if missing or found["mosaic"] not in SUPERPIXEL:
             raise SessionError(
@@ -61,14 +66,14 @@ class Session:
         path = Path(path)
         file, unfinished = open_for_reading(path)
         try:
-            return cls(path, file, unfinished)
+            return cls(path, Contents(path, file), unfinished)
         except SessionError:
             file.close()
             raise
 
     def close(self) -> None:
         """Closes the file; frames can no longer be read."""
-        self._file.close()
+        self.contents.close()
 
     def __enter__(self) -> Session:
         return self
@@ -95,12 +100,12 @@ class Session:
             IndexError: there is no such frame.
         """
         index = range(self._count)[index]
-        try:
-            pixels: Raw = self._dataset("camera/raw")[index]
-        except (OSError, RuntimeError) as error:
-            raise self._damaged(index) from error
-        if checksum(pixels) != int(self._dataset("camera/crc32")[index]):
-            raise self._damaged(index)
+        pixels: Raw = self.contents.read("camera/raw", index)
+        if checksum(pixels) != int(self.contents.read("camera/crc32", index)):
+            raise SessionError(
+                f"{self.path}: frame {index} is damaged (its pixels do not match their checksum); copy the "
+                f"file again from its source, or drop damaged frames with: s2p3 dataset repair {self.path}"
+            )
         return pixels
 
     def stokes(self, index: int, undistort: bool = True) -> Stokes:
@@ -143,22 +148,23 @@ class Session:
     @cached_property
     def drops(self) -> NDArray[np.void]:
         """The ledger of frames not stored: (D,) rows of frame_id, reason (bytes), host_time_ns."""
-        rows: NDArray[np.void] = self._dataset("camera/drops")[:]
+        rows: NDArray[np.void] = self.contents.read("camera/drops")
         return rows
 
     @cached_property
     def robot(self) -> RobotTrace | None:
         """Every robot sample of the recording; None where there was no robot."""
-        columns = {name: self._dataset(f"robot/{name}") for name in ROBOT_COLUMNS}
-        count = min(len(column) for column in columns.values())
+        count = min(self.contents.length(f"robot/{name}") for name in ROBOT_COLUMNS)
         if count == 0:
             return None
-        return RobotTrace(**{name: column[:count] for name, column in columns.items()})
+        return RobotTrace(
+            **{name: self.contents.read(f"robot/{name}", slice(count)) for name in ROBOT_COLUMNS}
+        )
 
     @cached_property
     def tcp_offset(self) -> NDArray[np.float64] | None:
         """(6,) flange<-tcp [x y z rx ry rz], metres and rotation vector; None where unknown."""
-        offset: NDArray[np.float64] = self._dataset("robot/tcp_offset")[:]
+        offset: NDArray[np.float64] = self.contents.read("robot/tcp_offset")
         return offset if np.isfinite(offset).all() else None
 
     @cached_property
@@ -185,9 +191,12 @@ class Session:
     @cached_property
     def intrinsics(self) -> Intrinsics | None:
         """Of the raw mosaic, as calibrated; None before calibration."""
-        if "calibration/K" not in self._file:
+        if not self.contents.has("calibration/K"):
             return None
-        matrix, distortion = self._dataset("calibration/K")[:], self._dataset("calibration/distortion")[:]
+        matrix, distortion = (
+            self.contents.read("calibration/K"),
+            self.contents.read("calibration/distortion"),
+        )
         return Intrinsics(matrix, distortion, self.camera.height, self.camera.width)
 
     @cached_property
@@ -202,21 +211,21 @@ class Session:
     @cached_property
     def calibration_json(self) -> str | None:
         """The calibration.json that was applied; None before calibration."""
-        if "calibration/json" not in self._file:
+        if not self.contents.has("calibration/json"):
             return None
-        return str(self._dataset("calibration/json").asstr()[()])
+        return self.contents.text("calibration/json")
 
     @cached_property
     def poses(self) -> SE3 | None:
         """T_base_cam at mid-exposure, a batch of N, NaN where unknown; None before annotation."""
-        if "poses/T_base_cam" not in self._file:
+        if not self.contents.has("poses/T_base_cam"):
             return None
-        return SE3.from_matrix(self._dataset("poses/T_base_cam")[:])
+        return SE3.from_matrix(self.contents.read("poses/T_base_cam"))
 
     @property
     def objects(self) -> tuple[str, ...]:
         """Names of the objects whose mesh the session holds."""
-        return tuple(self._file.get("objects", ()))
+        return self.contents.names("objects")
 
     def object(self, name: str) -> ObjectRecord:
         """An object's mesh and material.
@@ -227,16 +236,16 @@ class Session:
         if name not in self.objects:
             known = ", ".join(self.objects) or "none"
             raise SessionError(f"{self.path} holds no object {name!r}; its objects: {known}")
-        group = self._file[f"objects/{name}"]
+        root = f"objects/{name}"
         return ObjectRecord(
             name=name,
-            vertices=self._dataset(f"objects/{name}/vertices")[:],
-            faces=self._dataset(f"objects/{name}/faces")[:],
-            material=str(attribute(group, "material")),
-            refractive_index=float(attribute(group, "refractive_index")),
-            extinction=float(attribute(group, "extinction")),
-            symmetry=str(attribute(group, "symmetry")),
-            diameter=float(attribute(group, "diameter")),
+            vertices=self.contents.read(f"{root}/vertices"),
+            faces=self.contents.read(f"{root}/faces"),
+            material=str(self.contents.attribute(root, "material")),
+            refractive_index=float(self.contents.attribute(root, "refractive_index")),
+            extinction=float(self.contents.attribute(root, "extinction")),
+            symmetry=str(self.contents.attribute(root, "symmetry")),
+            diameter=float(self.contents.attribute(root, "diameter")),
         )
 
     def object_poses(self, name: str) -> ObjectPoses:
@@ -248,20 +257,20 @@ class Session:
         if name in self._object_poses:
             return self._object_poses[name]
         root = f"poses/objects/{name}"
-        if root not in self._file:
+        if not self.contents.has(root):
             raise SessionError(f"{self.path}: object {name!r} has no poses; run: s2p3 annotate {self.path}")
         self._object_poses[name] = ObjectPoses(
-            T_cam_obj=SE3.from_matrix(self._dataset(f"{root}/T_cam_obj")[:]),
-            visible_fraction=self._dataset(f"{root}/visible_fraction")[:],
-            bbox_xywh=self._dataset(f"{root}/bbox_xywh")[:],
-            masks=self._dataset(f"{root}/mask"),
+            T_cam_obj=SE3.from_matrix(self.contents.read(f"{root}/T_cam_obj")),
+            visible_fraction=self.contents.read(f"{root}/visible_fraction"),
+            bbox_xywh=self.contents.read(f"{root}/bbox_xywh"),
+            masks=StoredMasks(self.contents, f"{root}/mask"),
         )
         return self._object_poses[name]
 
     @property
     def splits(self) -> dict[str, NDArray[np.int64]]:
         """Frame indices by split name."""
-        return {name: self._dataset(f"splits/{name}")[:] for name in self._file.get("splits", ())}
+        return {name: self.contents.read(f"splits/{name}") for name in self.contents.names("splits")}
 
     @cached_property
     def _distorted_working_intrinsics(self) -> Intrinsics:
@@ -278,24 +287,11 @@ class Session:
         return intrinsics.undistort_map() if intrinsics.distortion.any() else None
 
     def _column(self, name: str) -> Any:
-        return self._dataset(f"camera/{name}")[: self._count]
+        return self.contents.read(f"camera/{name}", slice(self._count))
 
     def _clock(self, name: str) -> ClockFit | None:
-        a, b, sigma = (float(value) for value in self._dataset(f"clocks/{name}")[:])
+        a, b, sigma = (float(value) for value in self.contents.read(f"clocks/{name}"))
         return None if np.isnan(a) else ClockFit(a, b, sigma)
-
-    def _dataset(self, path: str) -> h5py.Dataset:
-        found = self._file.get(path) if self._file else None
-        if not isinstance(found, h5py.Dataset):
-            state = f"lacks the dataset {path}; see: s2p3 dataset validate {self.path}"
-            raise SessionError(f"{self.path} {state if self._file else 'is closed; open it again'}")
-        return found
-
-    def _damaged(self, index: int) -> SessionError:
-        return SessionError(
-            f"{self.path}: frame {index} is damaged (its pixels do not match their checksum); copy the file "
-            f"again from its source, or drop damaged frames with: s2p3 dataset repair {self.path}"
-        )
 
 
 @dataclass(frozen=True)

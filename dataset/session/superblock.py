@@ -1,51 +1,61 @@
-"""The first 48 bytes of an HDF5 file, as far as saving a damaged one needs them.
+"""The first 48 bytes of an HDF5 file, as far as reading what an accident left needs them.
 
-HDF5 refuses a file whose writer was killed, by a flag in its superblock. Marking the file as "being written
-for concurrent readers" lets it be read again, tail missing or not. Source: HDF5 File Format Specification
-3.0, sections II.A (superblock version 2 and 3) and "Jenkins' lookup3 checksum".
+HDF5 refuses a file whose writer was killed, by a flag in its superblock, and a file shorter than its
+superblock says. `HealedFile` shows HDF5 a superblock without the flag and with the true length; nothing on
+the disk is touched. (Opening such a file in single-writer-multiple-readers mode works too, but HDF5 then
+waits practically for ever on damaged metadata, expecting the dead writer to finish it.)
+
+Source: HDF5 File Format Specification 3.0, section II.A (superblock version 3) and Jenkins' lookup3 checksum.
 """
 
 from __future__ import annotations
 
+import io
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from dataset.errors import SessionError
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _VERSION = 3
-_FLAGS_AT = 11
+_FLAGS_AT, _END_AT = 11, 28
 _CHECKED = 44  # bytes before the checksum: offsets and lengths of 8 bytes, as every 64-bit file has them
-_OPEN_FOR_WRITING_AND_READERS = 0x05
 _WORD = 0xFFFFFFFF
 
 
-@contextmanager
-def marked_as_growing(path: Path) -> Iterator[None]:
-    """Sets the flag for as long as the block lasts, then puts the original bytes back.
+class HealedFile(io.FileIO):
+    """A read-only file whose superblock reads as if its writer had closed it.
 
     Raises:
         SessionError: the superblock is not one this toolkit writes, or is itself damaged.
     """
-    with path.open("r+b") as stream:
-        original = stream.read(_CHECKED + 4)
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "rb")
+        original = self.read(_CHECKED + 4)
         if len(original) < _CHECKED + 4 or original[:8] != _SIGNATURE or original[8] != _VERSION:
+            self.close()
             raise SessionError(
-                f"{path} has no superblock of a session; it cannot be repaired, use a copy of it"
+                f"{path} does not begin like a session and cannot be repaired; use a copy of it"
             )
         head = bytearray(original[:_CHECKED])
         if lookup3(bytes(head)) != struct.unpack("<I", original[_CHECKED:])[0]:
+            self.close()
             raise SessionError(
-                f"{path}: the first bytes are damaged; it cannot be repaired, use a copy of it"
+                f"{path}: its first bytes are damaged and cannot be repaired; use a copy of it"
             )
-        head[_FLAGS_AT] = _OPEN_FOR_WRITING_AND_READERS
-        _write_head(path, bytes(head) + struct.pack("<I", lookup3(bytes(head))))
-    try:
-        yield
-    finally:
-        _write_head(path, original)
+        head[_FLAGS_AT] = 0
+        head[_END_AT : _END_AT + 8] = struct.pack("<Q", path.stat().st_size)
+        self._head = bytes(head) + struct.pack("<I", lookup3(bytes(head)))
+
+    def readinto(self, buffer: Any) -> int:
+        """Reads into a writable buffer and returns the number of bytes read."""
+        start = self.tell()
+        count = super().readinto(buffer) or 0
+        healed = self._head[start : start + count]
+        memoryview(buffer).cast("B")[: len(healed)] = healed
+        return count
 
 
 def lookup3(data: bytes) -> int:
@@ -59,11 +69,6 @@ def lookup3(data: bytes) -> int:
         return c
     x, y, z = struct.unpack("<III", data.ljust(12, b"\0"))
     return _final((a + x) & _WORD, (b + y) & _WORD, (c + z) & _WORD)
-
-
-def _write_head(path: Path, head: bytes) -> None:
-    with path.open("r+b") as stream:
-        stream.write(head)
 
 
 def _rotate(value: int, bits: int) -> int:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dataset.session.files import attribute, open_for_reading
+from dataset.session.files import READ_ERRORS, attribute, open_for_reading
 from dataset.validate import annotation, content, structure
 from dataset.validate.annotation import mask_box
-from dataset.validate.problems import READ_ERRORS, Problem, View
+from dataset.validate.problems import Problem, View
 from dataset.validate.repair import RepairResult, repair
 from dataset.validate.summary import SessionInfo, info
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from dataset.errors import CalibrationError
 from dataset.intrinsics import Intrinsics
-from dataset.session.files import attribute
+from dataset.session.files import READ_ERRORS, attribute
 from dataset.session.records import ObjectRecord
-from dataset.validate.problems import READ_ERRORS, Problem, View, first_frames
+from dataset.validate.problems import Problem, View, first_frames
 
 _ORTHONORMAL = 1e-4
 _BOX_TOLERANCE_PX = 1.0

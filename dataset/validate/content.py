@@ -9,8 +9,8 @@ import numpy as np
 from dataset.compression import checksum
 from dataset.polarimetry import white_level
 from dataset.schema import FRAME_COLUMNS
-from dataset.session.files import attribute
-from dataset.validate.problems import READ_ERRORS, Problem, View, first_frames
+from dataset.session.files import READ_ERRORS, attribute
+from dataset.validate.problems import Problem, View, first_frames
 
 _CLOCK_RATE_TOLERANCE = 1e-3
 """Quartz is good to 1e-4; ten times that is a wrong fit, not a clock (our choice)."""

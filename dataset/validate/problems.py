@@ -10,8 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-READ_ERRORS = (OSError, RuntimeError, KeyError, ValueError)
-"""What h5py raises, depending on the place, when bytes in the file do not make sense."""
+from dataset.session.files import READ_ERRORS
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,13 @@ from dataset.errors import SessionError
 from dataset.schema import FRAME_COLUMNS
 from dataset.session.files import (
     LIBVER,
+    READ_ERRORS,
     attribute,
     check_format,
     in_use,
-    open_for_reading,
     open_hdf5,
+    open_healed,
 )
-from dataset.session.superblock import marked_as_growing
-from dataset.validate.problems import READ_ERRORS
 from dataset.validate.salvage import copy_content
 
 Progress = Callable[[int, int], None]
@@ -96,15 +95,8 @@ def _readable(path: Path) -> Iterator[tuple[h5py.File, bool]]:
     """The file opened by whatever means work, and whether it had been closed cleanly."""
     try:
         file, unfinished = open_hdf5(path)
-    except SessionError as error:
-        with marked_as_growing(path):
-            try:
-                file, _ = open_for_reading(path)
-            except SessionError as second:
-                raise SessionError(f"{path} is beyond repair ({second}); use a copy of it") from error
-            with file:
-                yield file, False
-        return
+    except SessionError:
+        file, unfinished = open_healed(path), True
     with file:
         yield file, not unfinished
 

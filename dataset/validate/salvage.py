@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from dataset.compression import compress
 from dataset.schema import DATASETS, DROP_DTYPE, ROBOT_COLUMNS, Dataset, declaration
-from dataset.session.files import make_dataset
-from dataset.validate.problems import READ_ERRORS
+from dataset.session.files import READ_ERRORS, make_dataset
 
 Indices = NDArray[np.int64]
 

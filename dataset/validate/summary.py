@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataset.frames import CameraInfo
-from dataset.session.files import attribute, open_for_reading
 from dataset.session.reader import Session
 
 
@@ -61,31 +60,30 @@ def info(path: str | Path) -> SessionInfo:
     """
     path = Path(path)
     with Session.open(path) as session:
-        file, _ = open_for_reading(path)
-        with file:
-            frames = len(session)
-            times = file["camera/camera_time_ns"]
-            fits = session.clocks
-            return SessionInfo(
-                path=str(path),
-                kind=session.kind,
-                schema=str(attribute(file, "schema")),
-                session_id=session.session_id,
-                created_utc=str(attribute(file, "created_utc")),
-                toolkit=str(attribute(file, "toolkit")),
-                complete=session.complete,
-                advice="" if session.complete else f"incomplete: run s2p3 dataset repair {path}",
-                repaired=str(attribute(file, "repaired") or ""),
-                size_bytes=path.stat().st_size,
-                camera=session.camera,
-                frames=frames,
-                drops=len(file["camera/drops"]),
-                duration_s=(int(times[frames - 1]) - int(times[0])) * 1e-9 if frames else 0.0,
-                robot_samples=len(file["robot/host_time_ns"]),
-                clocks=tuple(name for name in ("camera", "robot") if getattr(fits, name) is not None),
-                calibrated="calibration/K" in file,
-                posed="poses/T_base_cam" in file,
-                objects=session.objects,
-                annotated=tuple(file.get("poses/objects", ())),
-                splits={name: len(split) for name, split in file.get("splits", {}).items()},
-            )
+        contents = session.contents
+        frames = len(session)
+        ends = [int(contents.read("camera/camera_time_ns", i)) for i in (0, frames - 1)] if frames else [0]
+        fits = session.clocks
+        return SessionInfo(
+            path=str(path),
+            kind=session.kind,
+            schema=str(contents.attribute("/", "schema")),
+            session_id=session.session_id,
+            created_utc=str(contents.attribute("/", "created_utc")),
+            toolkit=str(contents.attribute("/", "toolkit")),
+            complete=session.complete,
+            advice="" if session.complete else f"incomplete: run s2p3 dataset repair {path}",
+            repaired=str(contents.attribute("/", "repaired") or ""),
+            size_bytes=path.stat().st_size,
+            camera=session.camera,
+            frames=frames,
+            drops=contents.length("camera/drops"),
+            duration_s=(ends[-1] - ends[0]) * 1e-9,
+            robot_samples=contents.length("robot/host_time_ns"),
+            clocks=tuple(name for name in ("camera", "robot") if getattr(fits, name) is not None),
+            calibrated=contents.has("calibration/K"),
+            posed=contents.has("poses/T_base_cam"),
+            objects=session.objects,
+            annotated=contents.names("poses/objects"),
+            splits={name: contents.length(f"splits/{name}") for name in contents.names("splits")},
+        )

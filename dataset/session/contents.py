@@ -1,0 +1,93 @@
+"""Guarded access to an open session file: whatever is missing or damaged becomes a `SessionError`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from dataset.errors import SessionError
+from dataset.session.files import attribute, reading
+
+
+class Contents:
+    """The groups, datasets and attributes of an open file.
+
+    Args:
+        path: of the file, for messages.
+        file: open for reading.
+    """
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self.path = path
+        self._file = file
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def has(self, path: str) -> bool:
+        """Whether the file holds this group or dataset."""
+        with reading(self.path):
+            return path in self._open_file()
+
+    def names(self, group: str) -> tuple[str, ...]:
+        """The members of a group; none where it is absent."""
+        with reading(self.path):
+            return tuple(self._open_file().get(group, ()))
+
+    def attribute(self, group: str, name: str) -> Any:
+        """An attribute as a plain Python value; None where it is absent."""
+        with reading(self.path):
+            return attribute(self._open_file()[group], name)
+
+    def length(self, path: str) -> int:
+        """Rows of a dataset."""
+        return int(self._dataset(path).shape[0])
+
+    def read(self, path: str, rows: slice | int = slice(None)) -> Any:
+        """Rows of a dataset as a numpy array; all of them unless told."""
+        dataset = self._dataset(path)
+        with reading(self.path, f"{path}[{rows}]" if isinstance(rows, int) else path):
+            return dataset[rows]
+
+    def text(self, path: str) -> str:
+        """A dataset that holds one string."""
+        dataset = self._dataset(path)
+        with reading(self.path, path):
+            return str(dataset.asstr()[()])
+
+    def _dataset(self, path: str) -> h5py.Dataset:
+        with reading(self.path):
+            found = self._open_file().get(path)
+        if not isinstance(found, h5py.Dataset):
+            raise SessionError(f"{self.path} lacks {path}; see: s2p3 dataset validate {self.path}")
+        return found
+
+    def _open_file(self) -> h5py.File:
+        if not self._file:
+            raise SessionError(f"{self.path} is closed; open it again")
+        return self._file
+
+
+class StoredMasks:
+    """Masks in a file, read one at a time.
+
+    Args:
+        contents: of the file; must stay open.
+        path: of the (N, h, w) dataset.
+    """
+
+    def __init__(self, contents: Contents, path: str) -> None:
+        self._contents = contents
+        self._path = path
+
+    def __len__(self) -> int:
+        return self._contents.length(self._path)
+
+    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
+        mask: NDArray[np.bool_] = self._contents.read(self._path, index) != 0
+        return mask

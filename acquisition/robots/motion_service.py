@@ -10,13 +10,17 @@ whenever the arm does not do what it should. Motions start asynchronously; "movi
 from __future__ import annotations
 
 import json
+import os
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
-from acquisition.simulation.process import die_with_parent, serve_commands
+from acquisition.simulation.process import serve_commands
 
+_PARENT_POLL_S = 0.2
+_FAREWELL_S = 1.0  # to end the program on the controller, which stops the arm
 _START_SEEN_WITHIN_S = 0.5  # a motion whose start is not seen in the status register by then is over
 
 
@@ -57,6 +61,8 @@ class MotionService:
         self._control.stopScript()
         self._control.disconnect()
 
+    # The requests; each returns its answer.
+
     def set_tcp(self, offset: list[float]) -> bool:
         return bool(self._control.setTcp(offset))
 
@@ -93,9 +99,17 @@ class MotionService:
         return accepted
 
 
+def _end_after(parent: int) -> None:
+    """Ends this process soon after its parent; in a thread, as the main one may hang in vendor code."""
+    while os.getppid() == parent:
+        time.sleep(_PARENT_POLL_S)
+    time.sleep(_FAREWELL_S)
+    os._exit(1)
+
+
 def main() -> int:
     """Serves requests until stdin ends or the parent process dies. Returns the exit code."""
-    die_with_parent()
+    threading.Thread(target=_end_after, args=(os.getppid(),), daemon=True).start()
     try:
         service = MotionService(sys.argv[1])
     except ImportError:

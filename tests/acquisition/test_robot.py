@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -30,6 +32,18 @@ PERIOD_S = 0.002  # of the simulated control loop, whatever the load of the host
 pytest.importorskip("rtde_control")
 
 
+CONNECT_AND_MOVE = """
+import os, pathlib, threading
+from acquisition.robot import RobotConfig
+from acquisition.robots.ur import UrRobot
+robot = UrRobot(RobotConfig("127.0.0.28", joint_speed=0.1))
+tasks = pathlib.Path(f"/proc/{os.getpid()}/task").iterdir()
+child = [pid for task in tasks for pid in (task / "children").read_text().split()]
+threading.Timer(0.5, lambda: print(*child, flush=True)).start()
+robot.move_joints(robot.sample().q + 0.5)
+"""
+
+
 def home_plus(*turns: float) -> np.ndarray:
     """The home configuration with each joint turned further, radians."""
     return HOME + np.array(turns)
@@ -47,6 +61,14 @@ def children() -> set[int]:
         with contextlib.suppress(FileNotFoundError):  # a thread that has just ended
             found.update(int(pid) for pid in (task / "children").read_text().split())
     return found
+
+
+def running(pid: int) -> bool:
+    """Whether a process exists and is more than an entry that nobody has collected yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def tool_speed(trace: RobotTrace) -> np.ndarray:
@@ -290,6 +312,24 @@ class TestConnecting:
         robot.close()
         assert children() == processes
         assert threading.active_count() <= threads
+
+    @pytest.mark.parametrize("controller_dies_too", [False, True])
+    def test_killing_the_toolkit_leaves_no_process(self, controller_dies_too: bool) -> None:
+        with SimulatedRobot("127.0.0.28") as simulator:
+            toolkit = subprocess.Popen(
+                [sys.executable, "-c", CONNECT_AND_MOVE], stdout=subprocess.PIPE, text=True
+            )
+            assert toolkit.stdout is not None
+            motion = int(toolkit.stdout.readline())
+            if controller_dies_too:
+                simulator.kill()
+            toolkit.kill()
+            toolkit.wait()
+            toolkit.stdout.close()
+            deadline = time.monotonic() + 10
+            while running(motion) and time.monotonic() < deadline:
+                time.sleep(0.1)
+            assert not running(motion)
 
     def test_hand_guided_reading_starts_no_process(self, arm: SimulatedRobot, robot: UrRobot) -> None:
         processes = children()

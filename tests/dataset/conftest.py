@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,29 +17,45 @@ from dataset.session import (
     write_calibration,
     write_object,
     write_poses,
+    write_split,
 )
-from dataset.session import write_split as store_split
 from dataset.validate import mask_box
 
 HEIGHT, WIDTH, FRAMES = 32, 48, 12
 
 
+CAMERA = CameraInfo("Vendor", "Model", "42", "1.0", "BayerRG12p", "colour", WIDTH, HEIGHT, 12, 9000)
+INTRINSICS = Intrinsics(
+    np.array([[40.0, 0, 23.7], [0, 40.5, 15.1], [0, 0, 1]]),
+    np.array([-0.1, 0.02, 0.001, -0.002]),
+    HEIGHT,
+    WIDTH,
+)
+TETRAHEDRON = ObjectRecord(
+    name="tetra",
+    vertices=0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]),
+    faces=np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32),
+    material="plastic",
+    refractive_index=1.5,
+    extinction=0.0,
+    symmetry="[]",
+    diameter=0.1 * np.sqrt(2),
+)
+
+
 @pytest.fixture
 def camera() -> CameraInfo:
-    return CameraInfo("Vendor", "Model", "42", "1.0", "BayerRG12p", "colour", WIDTH, HEIGHT, 12, 9000)
+    return CAMERA
 
 
 @pytest.fixture
 def intrinsics() -> Intrinsics:
-    matrix = np.array([[40.0, 0, 23.7], [0, 40.5, 15.1], [0, 0, 1]])
-    return Intrinsics(matrix, np.array([-0.1, 0.02, 0.001, -0.002]), HEIGHT, WIDTH)
+    return INTRINSICS
 
 
 @pytest.fixture
 def tetrahedron() -> ObjectRecord:
-    vertices = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
-    return ObjectRecord("tetra", vertices, faces, "plastic", 1.5, 0.0, "[]", 0.1 * np.sqrt(2))
+    return TETRAHEDRON
 
 
 @pytest.fixture
@@ -83,21 +100,27 @@ def poses() -> tuple[SE3, ObjectPoses]:
     return T_base_cam, ObjectPoses(T_base_cam.inverse(), np.full(FRAMES, 0.9), boxes, masks)
 
 
-@pytest.fixture
-def recorded(tmp_path: Path, camera: CameraInfo, intrinsics: Intrinsics, tetrahedron: ObjectRecord) -> Path:
+@pytest.fixture(scope="session")
+def master(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A complete, calibrated, annotated session without a problem."""
-    path = tmp_path / "session.h5"
-    with SessionWriter(path, "sequence", camera, rig_toml="[camera]\n") as writer:
+    path = tmp_path_factory.mktemp("master") / "session.h5"
+    with SessionWriter(path, "sequence", CAMERA, rig_toml="[camera]\n") as writer:
         for index in range(FRAMES):
             writer.add_frame(frame(index, index if index < 6 else index + 1))
         writer.add_drop(6, "queue full", 1_120_000_000)
         writer.add_robot_trace(trace(100), [0, 0, 0.1, 0, 0, 0])
         writer.add_robot_trace(trace(50, start=100), [0, 0, 0.1, 0, 0, 0])
         writer.set_clocks(camera=ClockFit(-6e9, 1.0, 300.0), robot=ClockFit(-99e9, 1.0, 400.0))
-    write_calibration(path, '{"fx": 40}', intrinsics)
-    write_object(path, tetrahedron)
+    write_calibration(path, '{"fx": 40}', INTRINSICS)
+    write_object(path, TETRAHEDRON)
     T_base_cam, object_poses = poses()
     write_poses(path, T_base_cam, 1e-4, np.full(FRAMES, 2e-4), {"tetra": object_poses})
-    store_split(path, "train", np.arange(9))
-    store_split(path, "test", [9, 11, 10])
+    write_split(path, "train", np.arange(9))
+    write_split(path, "test", [9, 11, 10])
     return path
+
+
+@pytest.fixture
+def recorded(master: Path, tmp_path: Path) -> Path:
+    """A copy of that session to do with as one likes."""
+    return Path(shutil.copy(master, tmp_path / "session.h5"))

@@ -146,7 +146,9 @@ def object_from_touches(
     """The pose of an object in the base frame from touched points.
 
     Args:
-        touches: a session of kind "tool_tip" (the arm at rest with the tip on the surface, see `touched_points`), or a text file of points: x y z a line, metres in the base frame, '#' starts a comment.
+        touches: a session of kind "tool_tip" (the arm at rest with the tip on the surface, see
+            `touched_points`), or a text file of points: x y z a line, metres in the base frame, '#' starts a
+            comment.
         vertices, faces: (V, 3) metres, (F, 3): the object.
         tip_in_tcp: (3,) the tip in the tool's frame, metres; only used with a session.
         init, symmetry_axis: as in `register_points`.

@@ -1,6 +1,7 @@
-"""What a lab records, from a rig file: the board, the object, touched points. Plans the motion and runs the recorder.
+"""What a lab records, from a rig file: the board, the object, touched points.
 
-Each capture opens the rig's devices, plans from the rig's guesses, records one session and closes the devices.
+Each capture opens the rig's devices, plans the motion from the rig's guesses, records one session, and closes
+the devices.
 """
 
 from __future__ import annotations
@@ -29,10 +30,12 @@ Floats = NDArray[np.float64]
 
 _CANDIDATE_VIEWS = 80
 _NOMINAL_FOCAL = 0.71
-"""Focal length in image widths, for planning only (our choice: the paper's 6 mm lens on a 2/3 inch sensor)."""
+"""Focal length in image widths, for planning only (our choice: the paper's 6 mm lens)."""
 _RADII_M = (0.38, 0.31, 0.45)
 """Distances from which the object is filmed, one sweep after the other (our choice)."""
 _ELEVATIONS_DEG = (30.0, 80.0)
+_ROLLS = tuple(np.deg2rad((-24.0, -12.0, 0.0, 12.0, 24.0)))
+"""Turns of the camera about its axis that let the arm move smoothly; the horizon stays nearly level."""
 _BOARD_SWEEP_VIEWS = 10
 
 
@@ -57,14 +60,16 @@ def capture_board(
         DeviceError: a device does not answer or stopped.
     """
     with _devices(rig) as (camera, robot), _writer(out, kind, camera.info, rig) as writer:
-        plan = plan_stills(_board_views(rig, camera.info, seed), _carried(rig, robot), robot.sample().q, views)
+        plan = plan_stills(
+            _board_views(rig, camera.info, seed), _carried(rig, robot), robot.sample().q, views
+        )
         return record_stills(camera, robot, plan.q, writer, on_progress=on_progress)
 
 
 def capture_board_motion(
     rig: Rig, out: Path, *, seconds: float, seed: int = 1, on_progress: OnProgress = lambda progress: None
 ) -> Progress:
-    """The board filmed while the arm moves: what the clock offset between camera and arm is estimated from."""
+    """The board filmed while the arm moves, from which the clock offset of camera and arm is estimated."""
     with _devices(rig) as (camera, robot), _writer(out, "hand_eye", camera.info, rig) as writer:
         views = _board_views(rig, camera.info, seed)
         plan = plan_stills(views, _carried(rig, robot), robot.sample().q, _BOARD_SWEEP_VIEWS)
@@ -83,18 +88,21 @@ def capture_sequence(
         q = robot.sample().q
         sweeps = []
         for radius in _RADII_M:
-            path = plan_path(hemisphere_path(centre, (radius, radius), _ELEVATIONS_DEG), carried, q)
+            views = hemisphere_path(centre, (radius, radius), _ELEVATIONS_DEG, rows=6)
+            path = plan_path(views, carried, q, _ROLLS)
             sweeps.append(path.q)
             q = path.q[-1]
         robot.move_joints(sweeps[0][0])
         motion = _to_and_fro(robot, sweeps)
-        return record_stream(camera, robot, writer, motion=motion, duration_s=seconds, on_progress=on_progress)
+        return record_stream(
+            camera, robot, writer, motion=motion, duration_s=seconds, on_progress=on_progress
+        )
 
 
 def capture_touches(
     rig: Rig, out: Path, *, count: int, on_progress: OnProgress = lambda progress: None
 ) -> Progress:
-    """Points touched with the measuring tip while the arm is guided by hand; the toolkit only reads the arm."""
+    """Points touched with the measuring tip while a hand guides the arm; the toolkit only reads it."""
     with open_pose_source(rig) as source, _writer(out, "tool_tip", NO_CAMERA, rig) as writer:
         touches = record_touches(source, writer, count, on_progress=on_progress)
     return Progress(len(touches), 0, 1.0)

@@ -4,7 +4,7 @@ file."""
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Literal
@@ -115,6 +115,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def links(pages: Mapping[str, str]) -> str:
+    """A line of links: the text of each, and the address relative to this page."""
+    anchors = (f'<a href="{escape(address)}">{escape(text)}</a>' for text, address in pages.items())
+    return f"<p>{' · '.join(anchors)}</p>"
 
 
 def note(text: str) -> str:

@@ -1,7 +1,8 @@
-"""Annotates a recorded session: where the camera was and where the object is, in every frame, without a human's click.
+"""Annotates a recorded session: where the camera was and where the object is, in every frame, without a
+human's click.
 
-T_cam_obj = T_base_cam^-1 T_base_obj: the arm's forward kinematics at the exposure, the hand-eye transform, and the pose
-at which the object was touched. Masks and boxes are rendered from it, in the undistorted image.
+T_cam_obj = T_base_cam^-1 T_base_obj: the arm's forward kinematics at the exposure, the hand-eye transform,
+and the pose at which the object was touched. Masks and boxes are rendered from it, in the undistorted image.
 """
 
 from __future__ import annotations
@@ -31,12 +32,15 @@ class Annotation:
     visible: int
 
 
-def annotate(path: Path, calibration: Calibration, model: ObjectModel, on_progress: Progress | None = None) -> Annotation:
+def annotate(
+    path: Path, calibration: Calibration, model: ObjectModel, on_progress: Progress | None = None
+) -> Annotation:
     """Writes camera poses, object poses, boxes and masks into a session, replacing earlier ones.
 
     Args:
         path: of a complete session with a robot trace.
-        calibration: with intrinsics, hand-eye and the object's pose; the time offset where the arm was moving.
+        calibration: with intrinsics, hand-eye and the object's pose; the time offset where the arm was
+            moving.
         model: the object.
 
     Raises:
@@ -48,21 +52,30 @@ def annotate(path: Path, calibration: Calibration, model: ObjectModel, on_progre
     if model.name not in calibration.objects:
         known = ", ".join(calibration.objects) or "none"
         raise CalibrationError(
-            f"calibration: no pose of {model.name!r} (objects: {known}); touch it and run `s2p3 calibrate object` first"
+            f"calibration: no pose of {model.name!r} (objects: {known}); "
+            "touch it and run `s2p3 calibrate object` first"
         )
     write_calibration(path, calibration.to_json(), calibration.intrinsics.intrinsics)
     write_object(path, model.to_record())
     with Session.open(path) as session:
         cameras = camera_poses(session, calibration)
-        poses = render_poses(session, cameras.T_base_cam.inverse() @ calibration.objects[model.name].T_base_obj, model, on_progress)
+        poses = render_poses(
+            session,
+            cameras.T_base_cam.inverse() @ calibration.objects[model.name].T_base_obj,
+            model,
+            on_progress,
+        )
     write_poses(path, cameras.T_base_cam, cameras.sigma_m, cameras.sigma_rad, {model.name: poses})
     return Annotation(len(poses.visible_fraction), int((poses.visible_fraction > 0).sum()))
 
 
-def render_poses(session: Session, T_cam_obj: SE3, model: ObjectModel, on_progress: Progress | None = None) -> ObjectPoses:
+def render_poses(
+    session: Session, T_cam_obj: SE3, model: ObjectModel, on_progress: Progress | None = None
+) -> ObjectPoses:
     """Masks, boxes and visibility of an object at known poses (N) in a session's undistorted image.
 
-    The visible fraction is the share of the silhouette inside the image; what occludes the object is not known.
+    The visible fraction is the share of the silhouette inside the image; what occludes the object is not
+    known.
     """
     camera = session.working_intrinsics
     height, width = camera.height, camera.width

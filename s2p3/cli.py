@@ -44,7 +44,8 @@ VERBS: dict[str, Verb | dict[str, Verb]] = {
 }
 
 _DESCRIPTION = (
-    "From a polarization camera and a robot arm to a trained 6-D object pose model, without annotating a single real image. "
+    "From a polarization camera and a robot arm to a trained 6-D object pose model, "
+    "without annotating a single real image. "
     "Start with `s2p3 demo`."
 )
 _USER_MISTAKE = 2
@@ -55,7 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one verb.
 
     Returns:
-        0, or 2 for a user's mistake (one line on stderr says what, where and what to do), or 130 after Ctrl-C.
+        0, or 2 for a user's mistake (one line on stderr says what, where and what to do), or 130 after
+        Ctrl-C.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:

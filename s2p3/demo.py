@@ -1,7 +1,8 @@
-"""The main job on the simulated lab, step by step: each step leaves its file and is not repeated when the demo is run again.
+"""The main job on the simulated lab, step by step: each step leaves its file and is not repeated when the
+demo is run again.
 
-Two things are kept apart on purpose. The steps see what a real lab would see: devices on the wire, files, calibration
-results. Only `compare` opens the simulated lab's hidden truth, to say how far off everything was.
+Two things are kept apart on purpose. The steps see what a real lab would see: devices on the wire, files,
+calibration results. Only `compare` opens the simulated lab's hidden truth, to say how far off everything was.
 """
 
 from __future__ import annotations
@@ -9,8 +10,10 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -25,7 +28,9 @@ from s2p3.annotation import annotate
 from s2p3.commands.capture import recording
 from s2p3.commands.output import counting
 from s2p3.config import PRESETS
-from s2p3.lab import Operator, found_lab, running_lab
+from s2p3.demo_report import compare, write_report
+from s2p3.evaluation import Evaluation
+from s2p3.lab import LabTruth, Operator, found_lab, running_lab
 from s2p3.lab.scene import board_spec
 from s2p3.learning import adapt, evaluate_split
 from s2p3.side_by_side import Training, run_side_by_side
@@ -33,6 +38,9 @@ from s2p3.synthesis import session_camera, synthesize
 from s2p3.training import labelled_crops, train_detector
 
 Step = tuple[str, str, Callable[[], None]]
+
+_TRAIN_SHARE, _VAL_SHARE = 0.4, 0.1
+"""Of the captured frames: seen without labels, and kept for tuning; the rest is the test (our choice)."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +79,8 @@ class Progress:
         self._settings = state["settings"]
         if self._settings != settings:
             raise ToolkitError(
-                f"{folder} holds a demo with other settings ({self._settings}); choose another --out, or delete the folder."
+                f"{folder} holds a demo with other settings ({self._settings}); "
+                "choose another --out, or delete the folder."
             )
         self.seconds = state["seconds"]
 
@@ -112,6 +121,14 @@ class Demo:
         self._truth, self._rig_path = found_lab(self.lab_folder, object_name, seed)
         self.rig = Rig.load(self._rig_path)
         self.experiment = PRESETS[plan.preset]()
+        self._devices = ExitStack()
+        self._serving = False
+
+    def __enter__(self) -> Demo:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close_lab()
 
     def steps(self) -> list[Step]:
         """Name, what the user reads, and the function of each step."""
@@ -131,11 +148,13 @@ class Demo:
         ]
 
     def film_board(self) -> None:
-        with running_lab(self._truth, self.rig):
-            with recording("stills") as report:
-                capture_board(self.rig, self._fresh(self.board), views=self.plan.board_views, seed=self.seed, on_progress=report)
-            with recording("in motion") as report:
-                capture_board_motion(self.rig, self._fresh(self.motion), seconds=self.plan.motion_s, on_progress=report)
+        self._open_lab()
+        with recording("stills") as report:
+            views = self.plan.board_views
+            capture_board(self.rig, self._fresh(self.board), views=views, seed=self.seed, on_progress=report)
+        with recording("in motion") as report:
+            seconds = self.plan.motion_s
+            capture_board_motion(self.rig, self._fresh(self.motion), seconds=seconds, on_progress=report)
 
     def calibrate_camera(self) -> None:
         with counting("detect the board") as report:
@@ -151,16 +170,22 @@ class Demo:
 
     def touch_object(self) -> None:
         count = self.plan.touches
-        with running_lab(self._truth, self.rig), Operator(self._truth, self._rig_path, count) as operator:
-            with recording("points") as report, operator.touching():
-                capture_touches(self.rig, self._fresh(self.touches), count=count, on_progress=report)
+        operator = Operator(self._truth, self._rig_path, count)
+        self._open_lab()
+        with operator, recording("points") as report, operator.touching():
+            capture_touches(self.rig, self._fresh(self.touches), count=count, on_progress=report)
         tip = self.rig.frames.T_tcp_tip
         model = self.model
-        add_object(self.touches, tip, model.name, model.vertices, model.faces, self.calibration, model.symmetry.axis)
+        add_object(
+            self.touches, tip, model.name, model.vertices, model.faces, self.calibration, model.symmetry.axis
+        )
 
     def film_object(self) -> None:
-        with running_lab(self._truth, self.rig), recording("frames") as report:
-            capture_sequence(self.rig, self._fresh(self.sequence), seconds=self.plan.sequence_s, on_progress=report)
+        self._open_lab()
+        with recording("frames") as report:
+            seconds = self.plan.sequence_s
+            capture_sequence(self.rig, self._fresh(self.sequence), seconds=seconds, on_progress=report)
+        self._close_lab()
 
     def annotate(self) -> None:
         with counting("masks and boxes") as report:
@@ -169,7 +194,15 @@ class Demo:
 
     def synthesize(self) -> None:
         with counting("images") as report:
-            synthesize(self.model, self.plan.synthetic, session_camera(self.calibration), self.seed, self.synthetic, 2, report)
+            synthesize(
+                self.model,
+                self.plan.synthetic,
+                session_camera(self.calibration),
+                self.seed,
+                self.synthetic,
+                2,
+                report,
+            )
 
     def train_detector(self) -> None:
         train_detector([self.synthetic], self.model, self.experiment, self.detector.parent)
@@ -193,12 +226,36 @@ class Demo:
         )
 
     def self_supervise(self) -> None:
-        adapt(self.sequence, "train", self.model, self.detector, self.teacher, self.student, self.adapted.parent)
+        adapt(
+            self.sequence, "train", self.model, self.detector, self.teacher, self.student, self.adapted.parent
+        )
 
     def evaluate(self) -> None:
         for name, network in (("teacher", self.teacher), ("before", self.student), ("after", self.adapted)):
             result = evaluate_split(self.sequence, "test", self.model, network, self.detector)
-            result.save(self.out / f"evaluation-{name}.json")
+            result.save(self._evaluation(name))
+
+    def report(self, seconds: dict[str, float]) -> dict[str, Any]:
+        """Compares with the hidden truth, writes result.json and report.html, and returns the result."""
+        runs = {name: Evaluation.load(self._evaluation(name)) for name in ("teacher", "before", "after")}
+        recordings = (self.board, self.motion, self.sequence)
+        calibration = Calibration.load(self.calibration)
+        result = compare(calibration, LabTruth.load(self._truth), recordings, runs, seconds)
+        write_report(self.out, result, self.calibration, self.sequence, self.model, runs)
+        return result
+
+    def _evaluation(self, name: str) -> Path:
+        return self.out / f"evaluation-{name}.json"
+
+    def _open_lab(self) -> None:
+        """Camera and arm serve until the last recording is made."""
+        if not self._serving:
+            self._devices.enter_context(running_lab(self._truth, self.rig))
+            self._serving = True
+
+    def _close_lab(self) -> None:
+        self._devices.close()
+        self._serving = False
 
     @property
     def _spec(self) -> BoardSpec:

@@ -1,4 +1,6 @@
-"""The two stages that meet captured frames, addressed as a lab does: a session, the name of a split, checkpoints."""
+"""The two stages that meet captured frames, addressed as a lab does: a session, the name of a split,
+checkpoints.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def adapt(
     return self_supervise(crops, model, teacher, student, out, settings or config.self_supervision)
 
 
-def evaluate_split(session: Path, split: str, model: ObjectModel, network: Path, detector: Path) -> Evaluation:
+def evaluate_split(
+    session: Path, split: str, model: ObjectModel, network: Path, detector: Path
+) -> Evaluation:
     """Evaluates a network on a split of an annotated session, see `evaluation.evaluate`.
 
     Raises:
@@ -59,5 +63,8 @@ def frames_of(session: Session, split: str) -> list[int]:
     """
     if split not in session.splits:
         known = ", ".join(session.splits) or "none"
-        raise SessionError(f"{session.path}: no split {split!r} (its splits: {known}); make one with: s2p3 dataset split {session.path}")
+        raise SessionError(
+            f"{session.path}: no split {split!r} (its splits: {known}); "
+            f"make one with: s2p3 dataset split {session.path}"
+        )
     return [int(index) for index in session.splits[split]]

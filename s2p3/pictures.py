@@ -32,14 +32,18 @@ def degree(stokes: Stokes, full_scale: float = 1.0) -> Picture:
 
 
 def angle(stokes: Stokes) -> Picture:
-    """(h, w, 3) BGR picture of the AoLP: hue is the angle (0 and 180 degrees alike), brightness the DoLP's root."""
+    """(h, w, 3) BGR picture of the AoLP: hue is the angle (0 and 180 degrees alike), brightness the DoLP's
+    root.
+    """
     hue = np.mod(stokes.aolp * (180 / np.pi), 180).astype(np.uint8)
     value = _to_bytes(np.sqrt(np.clip(stokes.dolp, 0, 1)))
     return cv2.cvtColor(np.dstack([hue, np.full_like(hue, 220), value]), cv2.COLOR_HSV2BGR)
 
 
 def normals(directions: NDArray[np.floating], mask: NDArray[np.bool_] | None = None) -> Picture:
-    """(h, w, 3) BGR picture of unit normals (h, w, 3) in the camera frame: x right red, y up green, towards the camera blue."""
+    """(h, w, 3) BGR picture of unit normals (h, w, 3) in the camera frame: x right red, y up green, towards
+    the camera blue.
+    """
     shown = np.stack([-directions[..., 2], -directions[..., 1], directions[..., 0]], axis=-1)
     picture = _to_bytes(0.5 + 0.5 * shown)
     if mask is not None:
@@ -61,10 +65,13 @@ def decode_picture(raw: Path, layout: Mosaic, out: Path, index: float) -> list[P
         raise ToolkitError(f"{raw} cannot be read as an image; give a PNG or TIFF of a raw mosaic.")
     if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
         raise ToolkitError(
-            f"{raw} is not a raw mosaic: shape {pixels.shape}, {pixels.dtype}; give a single-channel 8 or 16 bit image."
+            f"{raw} is not a raw mosaic: shape {pixels.shape}, {pixels.dtype}; "
+            "give a single-channel 8 or 16 bit image."
         )
     if index <= 1:
-        raise ToolkitError(f"--index {index:g} is not a refractive index of something in air; give a number above 1.")
+        raise ToolkitError(
+            f"--index {index:g} is not a refractive index of something in air; give a number above 1."
+        )
     stokes = decode(pixels, layout, bits=_significant_bits(pixels))
     priors = prior_normals(stokes, nominal_camera_matrix(*stokes.shape), index)
     pictures = {"s0": intensity(stokes), "dolp": degree(stokes), "aolp": angle(stokes)} | {

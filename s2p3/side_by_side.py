@@ -1,4 +1,4 @@
-"""Runs trainings side by side, a process and a thread each: two threads that share one training are slower."""
+"""Runs trainings side by side, a process and a thread each: two threads sharing one training are slower."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def run_side_by_side(trainings: Mapping[str, Training]) -> None:
     """Runs all trainings at once and shows how far each is.
 
     Raises:
-        ToolkitError: one of them failed, with the last line it wrote; the others are stopped, and go on from their
-            checkpoints next time.
+        ToolkitError: one of them failed, with the last line it wrote; the others are stopped, and go on from
+            their checkpoints next time.
     """
     with ExitStack() as stack:
         running = {name: _start(training, stack) for name, training in trainings.items()}

@@ -1,4 +1,6 @@
-"""`s2p3 calibrate ...`: each verb reads sessions, adds its result to calibration.json, and writes the report beside it."""
+"""`s2p3 calibrate ...`: each verb reads sessions, adds its result to calibration.json, and writes the report
+beside it.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,10 @@ def intrinsics(session: Path, *, rig: Path, calibration: Path = Path("calibratio
     with counting("detect the board") as report:
         done = add_intrinsics(session, board_of(rig), calibration, report)
     fx = done.intrinsics.K[0, 0]
-    console.print(f"fx {fx:.2f} +- {done.covariance[0, 0] ** 0.5:.2f} px, reprojection {done.rms_px:.3f} px, held out {done.held_out_px:.3f} px")
+    console.print(
+        f"fx {fx:.2f} +- {done.covariance[0, 0] ** 0.5:.2f} px, "
+        f"reprojection {done.rms_px:.3f} px, held out {done.held_out_px:.3f} px"
+    )
 
 
 def hand_eye(session: Path, *, rig: Path, calibration: Path = Path("calibration.json")) -> None:
@@ -55,7 +60,9 @@ def hand_eye(session: Path, *, rig: Path, calibration: Path = Path("calibration.
 
     with counting("detect the board") as report:
         done = add_hand_eye(session, board_of(rig), calibration, report)
-    console.print(f"hand-eye from {done.views} views: held out {done.held_out_mm:.3f} mm, {done.held_out_deg:.4f} deg")
+    console.print(
+        f"hand-eye from {done.views} views: held out {done.held_out_mm:.3f} mm, {done.held_out_deg:.4f} deg"
+    )
 
 
 def time_offset(session: Path, *, rig: Path, calibration: Path = Path("calibration.json")) -> None:

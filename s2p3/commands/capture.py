@@ -27,8 +27,9 @@ def capture(
     """Record a session with the devices of a rig; try it on the simulated ones with `s2p3 simulate`.
 
     Args:
-        what: `intrinsics` and `hand-eye`: stills of the board; `board-motion`: the board filmed in motion, for the clock
-            offset; `tool-tip`: points touched by hand; `sequence`: the object filmed from above.
+        what: `intrinsics` and `hand-eye`: stills of the board; `board-motion`: the board filmed in motion,
+            for the clock offset; `tool-tip`: points touched by hand; `sequence`: the object filmed from
+            above.
         rig: rig.toml with the devices' addresses.
         out: session file to write; never overwritten.
         views: stills to take.
@@ -59,7 +60,11 @@ def recording(label: str) -> Iterator[OnProgress]:
     with counting(label) as bar:
 
         def report(progress: Progress) -> None:
-            total = round(progress.frames / progress.done) if progress.done and progress.frames else progress.frames
+            total = (
+                round(progress.frames / progress.done)
+                if progress.done and progress.frames
+                else progress.frames
+            )
             bar(progress.frames, max(total, progress.frames))
 
         yield report

@@ -21,14 +21,23 @@ def doctor(*, rig: Path | None = None, json: bool = False) -> None:
 
     checks = run_checks(None if rig is None else Rig.load(rig))
     if json:
-        show({check.name: {"ok": check.ok, "detail": check.detail, "fix": check.fix} for check in checks}, as_json=True)
+        show(
+            {check.name: {"ok": check.ok, "detail": check.detail, "fix": check.fix} for check in checks},
+            as_json=True,
+        )
     else:
         for check in checks:
             mark = "[green]ok  [/green]" if check.ok else "[red]FAIL[/red]"
-            console.print(f"{mark} {check.name}: {check.detail}" + ("" if check.ok else f"  [bold]Fix:[/bold] {check.fix}"))
+            console.print(
+                f"{mark} {check.name}: {check.detail}"
+                + ("" if check.ok else f"  [bold]Fix:[/bold] {check.fix}")
+            )
     failed = [check.name for check in checks if not check.ok]
     if failed:
-        raise ToolkitError(f"doctor: {len(failed)} of {len(checks)} checks failed ({', '.join(failed)}); each line above says the fix")
+        raise ToolkitError(
+            f"doctor: {len(failed)} of {len(checks)} checks failed ({', '.join(failed)}); "
+            "each line above says the fix"
+        )
 
 
 def simulate(
@@ -52,6 +61,8 @@ def simulate(
     truth, rig_path = found_lab(lab, object, seed)
     devices = Rig.load(rig or rig_path)
     with running_lab(truth, devices):
-        console.print(f"camera PHX050S-Q at {devices.camera.address} (GigE Vision), UR5e at {devices.robot.host} (RTDE)")
+        console.print(
+            f"camera PHX050S-Q at {devices.camera.address} (GigE Vision), UR5e at {devices.robot.host} (RTDE)"
+        )
         console.print(f"try:  arv-tool-0.8    s2p3 doctor --rig {rig or rig_path}    Ctrl-C ends both")
         threading.Event().wait()

@@ -26,7 +26,8 @@ def synthesize(
     workers: int = 2,
     backend: Literal["analytic"] = "analytic",
 ) -> None:
-    """Render a training set: polarized images of the object with exact poses and masks, as a session of kind synthetic.
+    """Render a training set: polarized images of the object with exact poses and masks, as a session of kind
+    synthetic.
 
     Args:
         object: cup, fork, knife, bottle, or the name of the object in --mesh.
@@ -44,7 +45,9 @@ def synthesize(
 
     del backend  # one so far; the choice is in the interface that both will share
     with counting("synthesize") as report:
-        figures = render(named_object(object, mesh), count, session_camera(intrinsics), seed, out, workers, report)
+        figures = render(
+            named_object(object, mesh), count, session_camera(intrinsics), seed, out, workers, report
+        )
     console.print(f"{out}: {count} frames; {figures}")
 
 
@@ -98,7 +101,9 @@ def train_teacher(
     from s2p3.training import train_teacher as train
 
     _use_threads(threads)
-    console.print(str(train(sessions, named_object(object, mesh), _experiment(preset, config), out, cache=out.parent)))
+    console.print(
+        str(train(sessions, named_object(object, mesh), _experiment(preset, config), out, cache=out.parent))
+    )
 
 
 def train_student(
@@ -129,7 +134,9 @@ def train_student(
 
     _use_threads(threads)
     model = named_object(object, mesh)
-    console.print(str(train(sessions, model, _experiment(preset, config), out, cache=out.parent, teacher=teacher)))
+    console.print(
+        str(train(sessions, model, _experiment(preset, config), out, cache=out.parent, teacher=teacher))
+    )
 
 
 def train_self_supervised(

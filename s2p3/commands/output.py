@@ -8,7 +8,14 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 console = Console(stderr=True, highlight=False)
 """For people. Results that a script would read go to stdout."""
@@ -24,7 +31,13 @@ def counting(label: str) -> Iterator[Callable[[int, int], None]]:
 @contextmanager
 def counting_many(labels: Iterable[str]) -> Iterator[Callable[[str, int, int], None]]:
     """A progress bar with an ETA for each label; call the yielded function with (label, done, in all)."""
-    columns = (TextColumn("  {task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("  {task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console) as bar:
         tasks = {label: bar.add_task(label, total=None) for label in labels}
 

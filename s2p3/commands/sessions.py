@@ -103,7 +103,10 @@ def split(
     """
     from dataset.splits import split_session
 
-    show({name: len(indices) for name, indices in split_session(session, by, train, val, seed).items()}, as_json=False)
+    show(
+        {name: len(indices) for name, indices in split_session(session, by, train, val, seed).items()},
+        as_json=False,
+    )
 
 
 def decode(

@@ -13,7 +13,6 @@ from acquisition.simulation.controller import TRUE_TIME_VARIABLE
 from dataset.errors import DeviceError
 from dataset.transforms import SE3
 
-_FREQUENCY_HZ = 500.0
 _KEPT_S = 2.0
 _PATIENCE_S = 1.0
 
@@ -21,14 +20,14 @@ _PATIENCE_S = 1.0
 class ArmPose:
     """Follows the simulated controller and answers with the flange's exact pose at a past moment.
 
-    The simulated controller stamps each state with the true host time; that register exists for this reader only, a
-    real controller has none and the toolkit's driver does not read it.
+    The simulated controller stamps each state with the true host time; that register exists for this reader
+    only, a real controller has none and the toolkit's driver does not read it.
     """
 
-    def __init__(self, host: str) -> None:
-        self._host = host
-        self._times: deque[float] = deque(maxlen=int(_KEPT_S * _FREQUENCY_HZ))
-        self._poses: deque[np.ndarray] = deque(maxlen=int(_KEPT_S * _FREQUENCY_HZ))
+    def __init__(self, host: str, frequency_hz: float) -> None:
+        self._host, self._frequency_hz = host, frequency_hz
+        self._times: deque[float] = deque(maxlen=int(_KEPT_S * frequency_hz))
+        self._poses: deque[np.ndarray] = deque(maxlen=int(_KEPT_S * frequency_hz))
         self._lock = threading.Lock()
         threading.Thread(target=self._follow, daemon=True).start()
 
@@ -44,7 +43,9 @@ class ArmPose:
                 if self._times and self._times[-1] >= time_s:
                     return self._interpolate(time_s)
             sleep(0.002)
-        raise DeviceError(f"the simulated arm at {self._host} reported no pose for this exposure; is its process running?")
+        raise DeviceError(
+            f"the simulated arm at {self._host} reported no pose for this exposure; is its process running?"
+        )
 
     def _interpolate(self, time_s: float) -> SE3:
         after = int(np.searchsorted(self._times, time_s))
@@ -56,9 +57,10 @@ class ArmPose:
         return first.interpolate(second, (time_s - self._times[before]) / span)
 
     def _follow(self) -> None:
+        variables = (TRUE_TIME_VARIABLE, "actual_TCP_pose")
         while True:
             try:
-                with RtdeReader(self._host, (TRUE_TIME_VARIABLE, "actual_TCP_pose"), _FREQUENCY_HZ) as reader:
+                with RtdeReader(self._host, variables, self._frequency_hz) as reader:
                     while True:
                         for package in np.frombuffer(b"".join(reader.packages()), reader.dtype):
                             with self._lock:

@@ -18,14 +18,15 @@ from s2p3.lab.truth import LabTruth, sample_truth
 _LATENCY_MARGIN = 2.0
 _SHORTEST_LATENCY_S, _LONGEST_LATENCY_S = 0.2, 1.5
 _DUTY = 0.9
-"""Of a frame period, the share its latency takes: the camera delivers one frame before it exposes the next."""
+"""Of a frame period, the share its latency takes: the camera delivers one frame before it exposes the next.
+"""
 
 
 def found_lab(folder: Path, object_name: str, seed: int) -> tuple[Path, Path]:
     """The lab in a folder, founded there if it is new.
 
-    A machine that renders slowly gets a camera with a longer latency and a lower frame rate, so that the latency is
-    constant, as a camera's is. Everything else that is hidden depends on the seed alone.
+    A machine that renders slowly gets a camera with a longer latency and a lower frame rate, so that the
+    latency is constant, as a camera's is. Everything else that is hidden depends on the seed alone.
 
     Returns:
         The paths of truth.json and rig.toml.
@@ -38,8 +39,8 @@ def found_lab(folder: Path, object_name: str, seed: int) -> tuple[Path, Path]:
         truth = LabTruth.load(truth_path)
         if (truth.object_name, truth.seed) != (object_name, seed):
             raise ToolkitError(
-                f"{folder} holds a lab with {truth.object_name}, seed {truth.seed}; give --object {truth.object_name} "
-                f"--seed {truth.seed}, or another folder."
+                f"{folder} holds a lab with {truth.object_name}, seed {truth.seed}; "
+                f"give --object {truth.object_name} --seed {truth.seed}, or another folder."
             )
     else:
         model = objects.build(object_name)
@@ -55,11 +56,12 @@ def found_lab(folder: Path, object_name: str, seed: int) -> tuple[Path, Path]:
 def _rendering_allowance_s(truth: LabTruth) -> float:
     """Seconds that a frame needs on this machine, with a margin for what else runs on it."""
     scene = LabScene(truth)
-    above = SE3.from_rotvec(np.array([np.pi, 0.0, 0.0]), truth.T_base_object.translation + [0.0, 0.0, 0.4])
+    above = np.array([0.0, 0.0, 0.4])
+    view = SE3.from_rotvec(np.array([np.pi, 0.0, 0.0]), truth.T_base_object.translation + above)
     took = []
     for _ in range(6):
         started = time.perf_counter()
-        scene.render(above)
+        scene.render(view)
         took.append(time.perf_counter() - started)
     # The first one compiled.
     return float(np.clip(_LATENCY_MARGIN * np.median(took[1:]), _SHORTEST_LATENCY_S, _LONGEST_LATENCY_S))

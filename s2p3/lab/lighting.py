@@ -13,11 +13,15 @@ _LAMPS = 3
 
 def captured_light(rng: np.random.Generator) -> Light:
     """Ceiling lamps and bright walls, in the base frame."""
-    azimuth = rng.uniform(0, 2 * np.pi) + np.arange(_LAMPS) * 2 * np.pi / _LAMPS + rng.uniform(-0.5, 0.5, _LAMPS)
+    azimuth = (
+        rng.uniform(0, 2 * np.pi) + np.arange(_LAMPS) * 2 * np.pi / _LAMPS + rng.uniform(-0.5, 0.5, _LAMPS)
+    )
     elevation = rng.uniform(np.radians(35), np.radians(75), _LAMPS)
     level = np.cos(elevation)
     directions = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
-    walls = cv2.resize(rng.uniform(0.5, 1.5, (5, 10)).astype(np.float32), (128, 64), interpolation=cv2.INTER_CUBIC)
+    walls = cv2.resize(
+        rng.uniform(0.5, 1.5, (5, 10)).astype(np.float32), (128, 64), interpolation=cv2.INTER_CUBIC
+    )
     return Light(
         up=np.array([0.0, 0.0, 1.0]),
         ambient=0.3,

@@ -81,7 +81,9 @@ def touch(truth: LabTruth, rig: Rig, count: int) -> Iterator[int]:
 
 
 def _contacts(truth: LabTruth, candidates: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Points and outward normals in the base frame that a tip from above can reach, far ones first after each other."""
+    """Points and outward normals in the base frame that a tip from above can reach, far ones first after each
+    other.
+    """
     rng = np.random.default_rng(truth.seed + 3)
     mesh = objects.build(truth.object_name)
     corners = mesh.vertices[mesh.faces]
@@ -96,7 +98,9 @@ def _contacts(truth: LabTruth, candidates: int) -> Iterator[tuple[NDArray[np.flo
         yield points[index] + normals[index] * rng.normal(0, truth.touch_noise_m), normals[index]
 
 
-def _faces_outwards(points: NDArray[np.float64], normals: NDArray[np.float64], truth: LabTruth) -> NDArray[np.bool_]:
+def _faces_outwards(
+    points: NDArray[np.float64], normals: NDArray[np.float64], truth: LabTruth
+) -> NDArray[np.bool_]:
     """Not the inside of a cup: the wall faces away from the object's axis, or it faces up."""
     away = points - truth.T_base_object.translation
     return (np.einsum("ij,ij->i", away[:, :2], normals[:, :2]) > 0) | (normals[:, 2] > 0.8)

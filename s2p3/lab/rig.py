@@ -9,6 +9,8 @@ from dataset.transforms import SE3
 from s2p3.lab.truth import NOMINAL_BOARD_CENTRE, NOMINAL_OBJECT_CENTRE, NOMINAL_TCP_CAM, TCP_TIP
 
 BOARD = BoardTable()
+_FREQUENCY_HZ = 125.0
+"""Of the simulated arm: an e-Series' 500 Hz costs a third of a core that the simulated camera needs."""
 
 
 def lab_rig(frame_rate: float, camera_address: str = "127.0.0.1", arm_host: str = "127.0.0.1") -> Rig:
@@ -17,11 +19,11 @@ def lab_rig(frame_rate: float, camera_address: str = "127.0.0.1", arm_host: str 
     face_up = SE3.from_rotvec(np.array([np.pi, 0.0, 0.0]), np.array(NOMINAL_BOARD_CENTRE))
     board = face_up @ SE3.from_rotvec(np.zeros(3), -half_size)
     return Rig(
-        camera=CameraTable(
-            address=camera_address, exposure_us=8000.0, frame_rate=frame_rate, timeout_s=5.0
-        ),
+        camera=CameraTable(address=camera_address, exposure_us=8000.0, frame_rate=frame_rate, timeout_s=5.0),
         robot=RobotTable(
             host=arm_host,
+            frequency_hz=_FREQUENCY_HZ,
+            speed=0.35,
             joint_speed=0.9,
             joint_acceleration=1.2,
             tcp_offset=(0.0,) * 6,

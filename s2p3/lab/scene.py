@@ -1,4 +1,6 @@
-"""What the simulated camera sees: table, board and object, rendered for where the arm really is at an exposure."""
+"""What the simulated camera sees: table, board and object, rendered for where the arm really is at an
+exposure.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ class LabScene:
         self._rays = self._camera.rays().astype(np.float32)
 
     def render(self, T_base_cam: SE3) -> NDArray[np.float32]:
-        """The radiance (3, 1024, 1224) of S0, S1, S2 in a camera at T_base_cam; 1 is a white, well-lit surface."""
+        """The radiance (3, 1024, 1224) of S0, S1, S2 in a camera at T_base_cam; 1 is a white, well-lit
+        surface.
+        """
         image = render_table(self._table, self._rays, T_base_cam)
         T_cam_obj = T_base_cam.inverse() @ self.truth.T_base_object
         region = projected_region(self._mesh, T_cam_obj, self._camera)
@@ -77,7 +81,7 @@ class LabCamera:
         """See acquisition.simulation.patterns.FrameSource."""
         truth = self._scene.truth
         exposed_s = time_ns * 1e-9 + exposure_us * 0.5e-6 - truth.exposure_offset_s
-        stokes = self._scene.render(self._arm.at(exposed_s) @ truth.T_tcp_cam)
+        stokes = self._scene.render(truth.T_base_flange(self._arm.at(exposed_s)) @ truth.T_tcp_cam)
         signal = exposure_us / _REFERENCE_EXPOSURE_US * 10 ** (gain_db / 20)
         layout = pixel_formats.pixel_format(pixel_format)
         mosaic = self._sensor.expose(stokes, signal, layout.bits, layout.colour, self._rng)[:height, :width]
@@ -89,6 +93,6 @@ def board_spec(board: BoardTable) -> BoardSpec:
     return BoardSpec(**asdict(board))
 
 
-def camera_source(truth: str, arm_host: str) -> LabCamera:
+def camera_source(truth: str, arm_host: str, arm_hz: float) -> LabCamera:
     """What the simulated camera's `--source` names."""
-    return LabCamera(LabScene(LabTruth.load(Path(truth))), ArmPose(arm_host))
+    return LabCamera(LabScene(LabTruth.load(Path(truth))), ArmPose(arm_host, arm_hz))

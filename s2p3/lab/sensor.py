@@ -28,10 +28,13 @@ class Sensor:
     """Factor on the degree of polarization: wire-grid polarizers leak."""
     colour_gains: tuple[float, float, float] = (0.92, 1.0, 0.84)
     noise: Image = field(
-        default_factory=lambda: np.random.default_rng(0).standard_normal(1 << _TABLE_BITS, dtype=np.float32), repr=False
+        default_factory=lambda: np.random.default_rng(0).standard_normal(1 << _TABLE_BITS, dtype=np.float32),
+        repr=False,
     )
 
-    def expose(self, stokes: Image, signal: float, bits: int, colour: bool, rng: np.random.Generator) -> NDArray[np.uint16]:
+    def expose(
+        self, stokes: Image, signal: float, bits: int, colour: bool, rng: np.random.Generator
+    ) -> NDArray[np.uint16]:
         """Expose one frame.
 
         Args:

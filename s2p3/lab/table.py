@@ -16,7 +16,9 @@ Image = NDArray[np.float32]
 
 TABLE_SIZE_M = 3.0
 _SUBSAMPLES = 3
-"""Samples per pixel and axis: the board's corners are calibrated to a tenth of a pixel, so its edges must not alias."""
+"""Samples per pixel and axis: the board's corners are calibrated to a tenth of a pixel, so its edges must not
+alias.
+"""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,9 @@ class Table:
     T_base_board: SE3
     refractive_index: float = 1.5
     gloss: float = 0.25
-    """Specular reflection of the table's varnish, relative to a mirror: a table that does not polarize would give the object away."""
+    """Specular reflection of the table's varnish, relative to a mirror: a table that does not polarize would
+    give the object away.
+    """
     ambient: float = 0.55
     environment: float = 0.9
 
@@ -42,12 +46,16 @@ def wood_texture(rng: np.random.Generator, size: int = 2048) -> Image:
     bend = _smooth_noise(rng, size, 6)
     rows = np.linspace(0, 1, size, dtype=np.float32)[:, None]
     grain = 0.5 + 0.5 * np.sin(2 * np.pi * (60 * rows + 5 * bend))
-    fine = cv2.resize(rng.random((size, size // 16), dtype=np.float32), (size, size), interpolation=cv2.INTER_LINEAR)
+    fine = cv2.resize(
+        rng.random((size, size // 16), dtype=np.float32), (size, size), interpolation=cv2.INTER_LINEAR
+    )
     return (0.22 + 0.12 * grain + 0.16 * blotches + 0.06 * fine).astype(np.float32)
 
 
 def _smooth_noise(rng: np.random.Generator, size: int, cells: int) -> Image:
-    noise: Image = cv2.resize(rng.random((cells, cells), dtype=np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
+    noise: Image = cv2.resize(
+        rng.random((cells, cells), dtype=np.float32), (size, size), interpolation=cv2.INTER_CUBIC
+    )
     return noise
 
 
@@ -59,8 +67,9 @@ def render_table(table: Table, rays: Image, T_base_cam: SE3) -> Image:
         T_base_cam: where the camera is.
 
     Returns:
-        (3, h, w) float32: S0, S1, S2 of diffuse light (unpolarized) plus the varnish's specular light, polarized
-        perpendicularly to the plane of incidence (Fresnel). Rays that miss the table see a dim unpolarized room.
+        (3, h, w) float32: S0, S1, S2 of diffuse light (unpolarized) plus the varnish's specular light,
+        polarized perpendicularly to the plane of incidence (Fresnel). Rays that miss the table see a dim
+        unpolarized room.
     """
     T_board_cam = table.T_base_board.inverse() @ T_base_cam
     out = np.empty((3, *rays.shape[:2]), np.float32)
@@ -137,9 +146,21 @@ def _render(  # pragma: no cover - compiled
                 for a in range(_SUBSAMPLES):
                     for b in range(_SUBSAMPLES):
                         fy, fx = (a + 0.5) * step - 0.5, (b + 0.5) * step - 0.5
-                        sx = dx + 0.5 * fx * (rays[i, j + 1, 0] - rays[i, j - 1, 0]) + 0.5 * fy * (rays[i + 1, j, 0] - rays[i - 1, j, 0])
-                        sy = dy + 0.5 * fx * (rays[i, j + 1, 1] - rays[i, j - 1, 1]) + 0.5 * fy * (rays[i + 1, j, 1] - rays[i - 1, j, 1])
-                        sz = dz + 0.5 * fx * (rays[i, j + 1, 2] - rays[i, j - 1, 2]) + 0.5 * fy * (rays[i + 1, j, 2] - rays[i - 1, j, 2])
+                        sx = (
+                            dx
+                            + 0.5 * fx * (rays[i, j + 1, 0] - rays[i, j - 1, 0])
+                            + 0.5 * fy * (rays[i + 1, j, 0] - rays[i - 1, j, 0])
+                        )
+                        sy = (
+                            dy
+                            + 0.5 * fx * (rays[i, j + 1, 1] - rays[i, j - 1, 1])
+                            + 0.5 * fy * (rays[i + 1, j, 1] - rays[i - 1, j, 1])
+                        )
+                        sz = (
+                            dz
+                            + 0.5 * fx * (rays[i, j + 1, 2] - rays[i, j - 1, 2])
+                            + 0.5 * fy * (rays[i + 1, j, 2] - rays[i - 1, j, 2])
+                        )
                         su = R_board[0, 0] * sx + R_board[0, 1] * sy + R_board[0, 2] * sz
                         sv = R_board[1, 0] * sx + R_board[1, 1] * sy + R_board[1, 2] * sz
                         sw = R_board[2, 0] * sx + R_board[2, 1] * sy + R_board[2, 2] * sz
@@ -155,7 +176,9 @@ def _render(  # pragma: no cover - compiled
                 reach = t_base[2] / cosine
                 wx = t_base[0] + reach * (R_base[0, 0] * dx + R_base[0, 1] * dy + R_base[0, 2] * dz)
                 wy = t_base[1] + reach * (R_base[1, 0] * dx + R_base[1, 1] * dy + R_base[1, 2] * dz)
-                albedo = _bilinear(texture, (wx + 0.5 * TABLE_SIZE_M) * texels, (wy + 0.5 * TABLE_SIZE_M) * texels)
+                albedo = _bilinear(
+                    texture, (wx + 0.5 * TABLE_SIZE_M) * texels, (wy + 0.5 * TABLE_SIZE_M) * texels
+                )
                 shine = gloss
             root = math.sqrt(index * index - 1.0 + cosine * cosine)
             r_s = ((cosine - root) / (cosine + root)) ** 2
@@ -163,7 +186,7 @@ def _render(  # pragma: no cover - compiled
             diffuse = albedo * (ambient + 0.45 * cosine) * (1.0 - 0.5 * (r_s + r_p))
             specular = shine * environment * 0.5 * (r_s + r_p)
             polarized = shine * environment * 0.5 * (r_s - r_p)
-            # Azimuth of the normal in the ray's own basis (the shortest rotation of the optical axis onto the ray), y up.
+            # Azimuth of the normal in the ray's own basis (optical axis turned the shortest way to the ray), y up.
             along = nz + (dx * nx + dy * ny) / (1.0 + dz)
             ax, ay = nx - dx * along, -(ny - dy * along)
             length = ax * ax + ay * ay + 1e-12

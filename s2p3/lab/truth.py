@@ -1,6 +1,7 @@
 """What is true in the simulated lab: drawn from a seed, known to the simulators, never told to the toolkit.
 
-Only two readers exist: the simulated camera (which renders it) and the demo's last step (which compares what was recovered).
+Only two readers exist: the simulated camera (which renders it) and the demo's last step (which compares what
+was recovered).
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ MOSAIC_HEIGHT, MOSAIC_WIDTH = 2048, 2448
 
 @dataclass(frozen=True)
 class LabTruth:
-    """The hidden state of one simulated lab. Poses are UR pose vectors (6,): metres and a rotation vector in radians."""
+    """The hidden state of one simulated lab. Poses are UR pose vectors (6,): metres and a rotation vector in
+    radians.
+    """
 
     seed: int
     object_name: str
@@ -43,6 +46,9 @@ class LabTruth:
     """How much too fast the camera's clock runs."""
     arm_drift_ppm: float
     """How much too fast the arm controller's clock runs."""
+    arm_error_m: float
+    arm_error_rad: float
+    """Amplitudes of the arm's own error: its links are not quite what its controller computes with."""
     refractive_index: float
     dolp_scale: float
     read_noise: float
@@ -67,6 +73,13 @@ class LabTruth:
     def T_base_object(self) -> SE3:
         return SE3.from_pose6(np.array(self.base_object))
 
+    def T_base_flange(self, reported: SE3) -> SE3:
+        """Where the flange really is when the controller reports a pose: a little off, smoothly varying."""
+        wave = np.sin(2 * np.pi / _ARM_ERROR_PERIOD_M * reported.translation)
+        return reported @ SE3.exp(
+            np.concatenate([self.arm_error_m * wave, self.arm_error_rad * wave[[1, 2, 0]]])
+        )
+
     @property
     def time_offset_s(self) -> float:
         """What has to be added to a frame's time on the host to find the arm's pose at its exposure."""
@@ -82,14 +95,17 @@ class LabTruth:
             values = json.loads(path.read_text())
             return LabTruth(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
         except (OSError, ValueError, TypeError) as error:
-            raise ToolkitError(f"{path} is not the truth of a simulated lab ({error}); start the lab afresh in a new folder.") from error
+            raise ToolkitError(
+                f"{path} is not the truth of a simulated lab ({error}); start the lab afresh in a new folder."
+            ) from error
 
 
 # The furniture that a rig file knows roughly, as one knows it with a tape measure.
-NOMINAL_TCP_CAM = (0.0, -0.075, 0.045, 0.0, 0.0, 0.0)
+NOMINAL_TCP_CAM = (0.0, -0.075, 0.045, 0.0, 0.0, float(np.pi))
 NOMINAL_BOARD_CENTRE = (0.45, -0.22, 0.0)
 NOMINAL_OBJECT_CENTRE = (0.45, 0.20, 0.0)
 TCP_TIP = (0.0, 0.0, 0.18)
+_ARM_ERROR_PERIOD_M = 0.4
 NOMINAL_FOCAL_PX = 1739.0
 """A 6 mm lens on 3.45 um pixels."""
 
@@ -108,9 +124,11 @@ def sample_truth(
     """
     rng = np.random.default_rng(seed)
     focal = NOMINAL_FOCAL_PX * rng.uniform(0.97, 1.03)
-    tcp_cam = SE3.from_pose6(np.array(NOMINAL_TCP_CAM)) @ _small_motion(rng, translation_m=0.006, rotation_rad=0.06)
+    tcp_cam = SE3.from_pose6(np.array(NOMINAL_TCP_CAM)) @ _small_motion(
+        rng, translation_m=0.006, rotation_rad=0.06
+    )
     yaw = rng.uniform(-0.25, 0.25)
-    # OpenCV's board frame starts at a corner, x along the squares and z into the board: down, for a board on a table.
+    # OpenCV's board frame starts at a corner, z into the board: down, for a board on a table.
     flat = SE3.from_rotvec(np.array([np.pi, 0.0, 0.0]), np.zeros(3))
     centre = SE3.from_rotvec(np.zeros(3), -np.array([*board_size_m, 0.0]) / 2)
     T_base_board = _on_table(rng, NOMINAL_BOARD_CENTRE, yaw) @ flat @ centre
@@ -137,6 +155,8 @@ def sample_truth(
         exposure_offset_s=rng.uniform(0.020, 0.040),
         camera_drift_ppm=rng.uniform(-60, 60),
         arm_drift_ppm=rng.uniform(-60, 60),
+        arm_error_m=5e-5,
+        arm_error_rad=1e-4,
         refractive_index=nominal_index * rng.uniform(1.03, 1.08),
         dolp_scale=rng.uniform(0.93, 0.97),
         read_noise=2.5,
@@ -146,7 +166,9 @@ def sample_truth(
 
 
 def _small_motion(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> SE3:
-    return SE3.from_rotvec(rng.uniform(-rotation_rad, rotation_rad, 3), rng.uniform(-translation_m, translation_m, 3))
+    return SE3.from_rotvec(
+        rng.uniform(-rotation_rad, rotation_rad, 3), rng.uniform(-translation_m, translation_m, 3)
+    )
 
 
 def _on_table(rng: np.random.Generator, centre: tuple[float, float, float], yaw: float) -> SE3:

@@ -13,6 +13,8 @@ import hdf5plugin
 import numpy as np
 from numpy.typing import NDArray
 
+blosc2.set_releasegil(True)  # off by default, and then a recorder's threads would compress one after another
+
 LEVEL = 5
 """Of LZ4 behind bit shuffle: a 2448x2048 mosaic takes 8-10 ms on one core, higher levels gain nothing."""
 

@@ -34,7 +34,7 @@ class Surface:
     def of(model: ObjectModel) -> Surface:
         """The plain surface of a known object: black plastic, polished steel, dark glass. Specular light
         prevails on all three, so that nothing cancels its polarization (our choice)."""
-        albedo = {"steel": 0.0, "glass": 0.01}.get(model.material, 0.03)
+        albedo = {"steel": 0.0, "glass": 0.004}.get(model.material, 0.006)
         return Surface(model.refractive_index, model.extinction, albedo)
 
 

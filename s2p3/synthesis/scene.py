@@ -145,7 +145,7 @@ def expose(stokes: Stokes, parameters: SceneParameters, bits: int, rng: np.rando
 
 @lru_cache(maxsize=1)
 def _noise() -> Image:
-    """A long row of normal deviates; each frame reads it from another place, which is cheaper than drawing."""
+    """A long row of normal deviates; each frame reads it from another place: cheaper than drawing."""
     return np.random.default_rng(0).standard_normal(_NOISE_COUNT, dtype=np.float32)
 
 

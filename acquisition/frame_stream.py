@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from acquisition.camera import Camera
 from acquisition.clocks import FEWEST_SAMPLES, fit_clock
-from dataset.errors import ToolkitError
+from dataset.errors import DeviceError, ToolkitError
 from dataset.frames import RawFrame
 from dataset.session import Chunk, SessionWriter, compress
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 QUEUE_FULL = "recorder busy: queue full"
 NOT_RECEIVED = "lost on the way, or not read in time"
+
+_SECOND_LOOK_S = 0.5
 
 UNKNOWN_FRAME_ID = -1
 """Stands in the ledger for a frame that was asked for and never came."""
@@ -136,7 +138,7 @@ class FrameStream:
     def _read(self) -> None:
         try:
             while not self._stopping.is_set():
-                frame = self._camera.read()
+                frame = self._next_frame()
                 if self._slots.acquire(blocking=False):
                     chunk = self._pool.submit(compress, frame.pixels)
                     self._items.put(_Item(frame.frame_id, frame.host_time_ns, frame, chunk))
@@ -148,6 +150,13 @@ class FrameStream:
                 self._fail(error)
         finally:
             self._items.put(None)
+
+    def _next_frame(self) -> RawFrame:
+        try:
+            return self._camera.read()
+        except DeviceError:
+            # A host that stood still for longer than the time-out finds the frames waiting in the driver.
+            return self._camera.read(_SECOND_LOOK_S)
 
     def _write(self) -> None:
         while (item := self._items.get()) is not None:

@@ -40,6 +40,10 @@ NO_CAMERA = CameraInfo("none", "none", "", "", "Mono8", "mono", width=2, height=
 
 _TICK_S = 0.1
 
+_TRACE_MARGIN_S = 0.2
+"""How much longer than the frames the arm's trace is at either end: a delay between the two clocks, not yet
+known, must not leave a frame without its pose (our choice)."""
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -180,8 +184,10 @@ def _recording(
 ) -> Iterator[tuple[FrameLedger, TraceLog]]:
     """Camera started and trace running; the clocks are stored at the end, however it comes."""
     ledger = FrameLedger(writer)
+    margin_s = 0.0 if robot is None else _TRACE_MARGIN_S
     with TraceLog(robot, writer) as log:
         try:
+            time.sleep(margin_s)
             camera.start(trigger)
             yield ledger, log
         except BaseException:
@@ -193,6 +199,7 @@ def _recording(
             raise
         camera.stop()
         ledger.store_clock()
+        time.sleep(margin_s)
 
 
 def _triggered_frame(camera: Camera, ledger: FrameLedger) -> RawFrame:

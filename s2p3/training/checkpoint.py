@@ -85,8 +85,11 @@ def read_info(path: Path, kind: Kind | None = None, object_name: str | None = No
         raise ToolkitError(f"{description}: not JSON ({error}); train again or restore the file") from error
     if values.pop("format", None) != FORMAT:
         raise ToolkitError(f"{description}: not a checkpoint this version reads ({FORMAT}); train again")
-    config = typed_toml.loads(ExperimentConfig, values.pop("config"), source=str(description))
-    info = CheckpointInfo(config=config, **values)
+    try:
+        config = typed_toml.loads(ExperimentConfig, values.pop("config"), source=str(description))
+        info = CheckpointInfo(config=config, **values)
+    except (TypeError, KeyError) as error:
+        raise ToolkitError(f"{description}: fields missing or unknown ({error}); train again") from error
     if kind is not None and info.kind != kind:
         raise ToolkitError(f"{path}: holds a {info.kind}, not a {kind}; give the {kind}'s checkpoint")
     if object_name is not None and info.object_name != object_name:

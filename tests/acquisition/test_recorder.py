@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from acquisition.camera import CameraConfig
 from acquisition.cameras.aravis import AravisCamera
-from acquisition.frame_stream import NOT_RECEIVED, QUEUE_FULL, UNKNOWN_FRAME_ID, FrameLedger, FrameStream
+from acquisition.frame_stream import UNKNOWN_FRAME_ID
 from acquisition.recorder import NO_CAMERA, Progress, record_stills, record_stream, record_touches
 from acquisition.robot import RobotConfig
 from acquisition.robots.rtde import RtdeReader
@@ -184,44 +184,6 @@ def test_the_time_being_over_stops_every_move_of_a_motion(
     assert np.abs(robot.sample().q - PATH[-1]).max() > 0.02
     with Session.open(tmp_path / "s.h5") as session:
         assert session.complete
-
-
-def test_incomplete_frames_are_ledgered(
-    tmp_path: Path, simulated_camera: SimulatedCamera, camera: AravisCamera
-) -> None:
-    simulated_camera.set_lost_ratio(0.02)
-    try:
-        with SessionWriter(tmp_path / "s.h5", "sequence", camera.info) as writer:
-            record_stream(camera, None, writer, duration_s=1.5)
-    finally:
-        simulated_camera.set_lost_ratio(0.0)
-    statistics = camera.statistics
-    with Session.open(tmp_path / "s.h5") as session:
-        assert_accounted(session)
-        lost = session.drops[session.drops["reason"] == NOT_RECEIVED.encode()]
-        assert 0 < len(lost) <= statistics.incomplete + statistics.discarded + statistics.underruns
-        assert (lost["host_time_ns"] > session.host_time_ns[0]).all()
-
-
-class SlowDisk(SessionWriter):
-    """A writer on a disk that is too slow for the camera."""
-
-    def add_frame(self, frame: RawFrame, chunk: Chunk | None = None) -> int:
-        time.sleep(0.05)
-        return super().add_frame(frame, chunk)
-
-
-def test_frames_that_the_disk_cannot_take_are_ledgered(tmp_path: Path, camera: AravisCamera) -> None:
-    with SlowDisk(tmp_path / "s.h5", "sequence", camera.info) as writer:
-        ledger = FrameLedger(writer)
-        camera.start("free")
-        with FrameStream(camera, ledger, depth=2):
-            time.sleep(1.0)
-        camera.stop()
-    with Session.open(tmp_path / "s.h5") as session:
-        assert_accounted(session)
-        assert (len(session), len(session.drops)) == (ledger.stored, ledger.dropped)
-        assert QUEUE_FULL.encode() in session.drops["reason"]
 
 
 class FullDisk(SessionWriter):

@@ -11,7 +11,7 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from s2p3.lab import LabTruth, Operator, found_lab, running_lab
 from s2p3.lab.scene import board_spec
 from s2p3.learning import adapt, evaluate_split
 from s2p3.side_by_side import Training, run_side_by_side
-from s2p3.synthesis import session_camera, synthesize
+from s2p3.synthesis import SYNTHETIC, Views, session_camera, synthesize
 from s2p3.training import labelled_crops, train_detector
 
 Step = tuple[str, str, Callable[[], None]]
@@ -60,8 +60,13 @@ class Plan:
     """Synthetic frames to train on."""
 
 
-FULL = Plan(preset="fast", board_views=24, motion_s=14.0, touches=24, sequence_s=120.0, synthetic=1400)
-QUICK = Plan(preset="quick", board_views=16, motion_s=8.0, touches=16, sequence_s=16.0, synthetic=96)
+FULL = Plan(preset="fast", board_views=24, motion_s=14.0, touches=40, sequence_s=120.0, synthetic=1400)
+QUICK = Plan(preset="quick", board_views=16, motion_s=8.0, touches=30, sequence_s=16.0, synthetic=96)
+
+
+_WORKERS = 2
+_DOMAIN = replace(SYNTHETIC, views=Views(distance_m=(0.27, 0.52), elevation_deg=(25.0, 82.0)))
+"""Synthetic views are distributed as the captured ones are, as in the paper."""
 
 
 class Progress:
@@ -194,15 +199,9 @@ class Demo:
 
     def synthesize(self) -> None:
         with counting("images") as report:
-            synthesize(
-                self.model,
-                self.plan.synthetic,
-                session_camera(self.calibration),
-                self.seed,
-                self.synthetic,
-                2,
-                report,
-            )
+            camera = session_camera(self.calibration)
+            count, workers = self.plan.synthetic, _WORKERS
+            synthesize(self.model, count, camera, self.seed, self.synthetic, workers, report, _DOMAIN)
 
     def train_detector(self) -> None:
         train_detector([self.synthetic], self.model, self.experiment, self.detector.parent)

@@ -11,6 +11,7 @@ import argparse
 import contextlib
 import importlib
 import json
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from dataset.pixel_formats import pack, pixel_format
 if TYPE_CHECKING:
     from acquisition.simulation.patterns import FrameSource
 
+_PRIORITY = -5  # a camera keeps its time however busy the host is
 DEFAULT_SOURCE = "acquisition.simulation.patterns:MovingPattern"
 
 
@@ -132,6 +134,8 @@ def load_source(specification: str, arguments: Mapping[str, Any]) -> FrameSource
 def main() -> None:
     """Serves until stdin ends or the parent dies."""
     die_with_parent()
+    with contextlib.suppress(PermissionError):
+        os.nice(_PRIORITY)
     options = _parse()
     try:
         _serve(options)

@@ -15,7 +15,7 @@ from s2p3.lab.rig import BOARD, lab_rig
 from s2p3.lab.scene import LabScene
 from s2p3.lab.truth import LabTruth, sample_truth
 
-_LATENCY_MARGIN = 2.0
+_LATENCY_MARGIN = 2.5
 _SHORTEST_LATENCY_S, _LONGEST_LATENCY_S = 0.2, 1.5
 _DUTY = 0.9
 """Of a frame period, the share its latency takes: the camera delivers one frame before it exposes the next.

@@ -22,10 +22,13 @@ from dataset.transforms import SE3
 from s2p3 import objects
 from s2p3.lab.truth import LabTruth
 
-_HOLD_S = 0.75
+_CANDIDATES = 600
+_HOLD_S = 0.9
 """How long the tip rests on a point; the recorder wants 0.6 s."""
 _RETREAT_M = 0.04
-_CLEARANCE_M = 0.012
+_NORMAL_WEIGHT = 0.25
+"""Of a difference in normals against one in position, in diameters, when touches are spread."""
+_CLEARANCE_M = 0.002
 """Points lower above the table than this are not touched: the tip has a body."""
 
 
@@ -63,7 +66,7 @@ def touch(truth: LabTruth, rig: Rig, count: int) -> Iterator[int]:
     with UrRobot(rig.robot) as arm:
         q = arm.sample().q
         touched = 0
-        for point, normal in _contacts(truth, 6 * count):
+        for point, normal in _contacts(truth, _CANDIDATES):
             contact = _tip_pose(point, normal) @ T_tip_tcp
             retreat = SE3(contact.rotation, contact.translation - _RETREAT_M * contact.rotation[:, 2])
             q_contact = arm.inverse_kinematics(contact, q)
@@ -80,10 +83,11 @@ def touch(truth: LabTruth, rig: Rig, count: int) -> Iterator[int]:
                 return
 
 
-def _contacts(truth: LabTruth, candidates: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Points and outward normals in the base frame that a tip from above can reach, far ones first after each
-    other.
-    """
+def _contacts(
+    truth: LabTruth, candidates: int
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Points and outward normals in the base frame that a tip from above can reach, each far from those before
+    it: a person feels for the handle as well as for the wall."""
     rng = np.random.default_rng(truth.seed + 3)
     mesh = objects.build(truth.object_name)
     corners = mesh.vertices[mesh.faces]
@@ -93,9 +97,20 @@ def _contacts(truth: LabTruth, candidates: int) -> Iterator[tuple[NDArray[np.flo
     weights = rng.dirichlet((1.0, 1.0, 1.0), size=candidates)
     points = truth.T_base_object.apply((weights[:, :, None] * corners[chosen]).sum(axis=1))
     normals = (crosses[chosen] / areas[chosen, None]) @ truth.T_base_object.rotation.T
-    outside = _faces_outwards(points, normals, truth)
-    for index in np.flatnonzero((points[:, 2] > _CLEARANCE_M) & (normals[:, 2] > -0.3) & outside):
+    reachable = (points[:, 2] > _CLEARANCE_M) & (normals[:, 2] > -0.3) & _faces_outwards(points, normals, truth)
+    points, normals = points[reachable], normals[reachable]
+    for index in _farthest_first(np.hstack([points / mesh.diameter, _NORMAL_WEIGHT * normals])):
         yield points[index] + normals[index] * rng.normal(0, truth.touch_noise_m), normals[index]
+
+
+def _farthest_first(features: NDArray[np.float64]) -> Iterator[int]:
+    """Indices of (n, d) points, each the farthest from those before it."""
+    nearest = np.full(len(features), np.inf)
+    index = 0
+    for _ in range(len(features)):
+        yield index
+        nearest = np.minimum(nearest, np.linalg.norm(features - features[index], axis=1))
+        index = int(nearest.argmax())
 
 
 def _faces_outwards(

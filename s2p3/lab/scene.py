@@ -61,8 +61,8 @@ class LabScene:
             window = raster.window
             light = self._light.turned(T_base_cam.inverse())
             stokes = shade(raster.normals, self._rays[window], raster.mask, self._surface, light)
-            for channel in range(3):
-                image[(channel, *window)][raster.mask] = stokes[channel][raster.mask]
+            for shown, drawn in zip(image, stokes, strict=True):
+                shown[window][raster.mask] = drawn[raster.mask]
         return image
 
 

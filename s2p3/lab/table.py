@@ -186,7 +186,7 @@ def _render(  # pragma: no cover - compiled
             diffuse = albedo * (ambient + 0.45 * cosine) * (1.0 - 0.5 * (r_s + r_p))
             specular = shine * environment * 0.5 * (r_s + r_p)
             polarized = shine * environment * 0.5 * (r_s - r_p)
-            # Azimuth of the normal in the ray's own basis (optical axis turned the shortest way to the ray), y up.
+            # Azimuth of the normal in the ray's basis: the optical axis turned the shortest way, y up.
             along = nz + (dx * nx + dy * ny) / (1.0 + dz)
             ax, ay = nx - dx * along, -(ny - dy * along)
             length = ax * ax + ay * ay + 1e-12

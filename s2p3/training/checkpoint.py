@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -58,6 +59,7 @@ def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
     description = {"format": FORMAT, **asdict(info), "config": typed_toml.dumps(info.config)}
     path.with_suffix(".json").write_text(json.dumps(description, indent=1), encoding="utf-8")
     save_tensors(path, weights)
+    shutil.copymode(path.with_suffix(".json"), path)  # safetensors writes files that only their owner can read
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
-from acquisition.simulation.process import SimulatorProcess
+from acquisition.process import ChildProcess
 from dataset.errors import DeviceError
 
 SCRIPT_PORT = 30003
@@ -36,7 +36,7 @@ class MotionClient:
         self._host = host
         self._check = check
         self._on_start = on_start
-        self._process: SimulatorProcess | None = None
+        self._process: ChildProcess | None = None
         self._waiter = ThreadPoolExecutor(1, thread_name_prefix="motion")
 
     def ask(self, verb: str, **arguments: Any) -> Any:
@@ -74,12 +74,12 @@ class MotionClient:
             process.stop(timeout_s=2.0)
         self._waiter.shutdown()
 
-    def _ensure_started(self) -> SimulatorProcess:
+    def _ensure_started(self) -> ChildProcess:
         if self._process is not None and self._process.running:
             return self._process
         for port in (SCRIPT_PORT, DASHBOARD_PORT):
             _probe(self._host, port)
-        process = SimulatorProcess(
+        process = ChildProcess(
             "acquisition.robots.motion_service", [self._host], ready_timeout_s=_START_TIMEOUT_S
         )
         try:

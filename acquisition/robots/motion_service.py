@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from acquisition.simulation.process import serve_commands
+from acquisition.process import serve_commands
 
 _PARENT_POLL_S = 0.2
 _FAREWELL_S = 1.0  # to end the program on the controller, which stops the arm

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from acquisition.process import ChildProcess, die_with_parent, serve_commands
 from acquisition.simulation.fake_device import Exposure, FakeDevice
-from acquisition.simulation.process import SimulatorProcess, die_with_parent, serve_commands
 from dataset.errors import ToolkitError
 from dataset.pixel_formats import pack, pixel_format
 
@@ -85,7 +85,7 @@ class Sensor:
         return self._clock.to_camera(start_ns)
 
 
-class SimulatedCamera(SimulatorProcess):
+class SimulatedCamera(ChildProcess):
     """Starts the simulated camera as a process; a context manager that ends it."""
 
     def __init__(

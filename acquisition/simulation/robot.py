@@ -19,11 +19,11 @@ import threading
 import time
 from collections.abc import Callable
 
+from acquisition.process import ChildProcess, die_with_parent, serve_commands
 from acquisition.robots.rtde import PORT as RTDE_PORT
 from acquisition.simulation.arm import HOME
 from acquisition.simulation.controller import INPUTS, OUTPUTS, SOFTWARE_VERSION, Controller
 from acquisition.simulation.dashboard import serve_dashboard
-from acquisition.simulation.process import SimulatorProcess, die_with_parent, serve_commands
 from acquisition.simulation.rtde_server import RtdeServer
 from dataset.errors import DeviceError, ToolkitError
 
@@ -35,7 +35,7 @@ _PRIORITY = -10  # where it is permitted: a real controller is not held up by th
 _LARGEST_LAG_S = 0.5  # beyond it the arm lost time; it goes on from now instead of catching up
 
 
-class SimulatedRobot(SimulatorProcess):
+class SimulatedRobot(ChildProcess):
     """The simulated arm, started and stopped as a context manager.
 
     Args:

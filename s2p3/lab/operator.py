@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from acquisition.process import ChildProcess, die_with_parent, serve_commands
 from acquisition.rig import Rig
 from acquisition.robots.ur import UrRobot
-from acquisition.simulation.process import SimulatorProcess, die_with_parent, serve_commands
 from dataset.transforms import SE3
 from s2p3 import objects
 from s2p3.lab.truth import LabTruth
@@ -32,7 +32,7 @@ _CLEARANCE_M = 0.002
 """Points lower above the table than this are not touched: the tip has a body."""
 
 
-class Operator(SimulatorProcess):
+class Operator(ChildProcess):
     """Starts the operator; from then on touches point after point until it has touched `count`."""
 
     def __init__(self, truth_path: Path, rig_path: Path, count: int) -> None:
@@ -83,11 +83,9 @@ def touch(truth: LabTruth, rig: Rig, count: int) -> Iterator[int]:
                 return
 
 
-def _contacts(
-    truth: LabTruth, candidates: int
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Points and outward normals in the base frame that a tip from above can reach, each far from those before
-    it: a person feels for the handle as well as for the wall."""
+def _contacts(truth: LabTruth, candidates: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Points and outward normals in the base frame that a tip from above can reach, each far from those
+    before it: a person feels for the handle as well as for the wall."""
     rng = np.random.default_rng(truth.seed + 3)
     mesh = objects.build(truth.object_name)
     corners = mesh.vertices[mesh.faces]
@@ -97,7 +95,9 @@ def _contacts(
     weights = rng.dirichlet((1.0, 1.0, 1.0), size=candidates)
     points = truth.T_base_object.apply((weights[:, :, None] * corners[chosen]).sum(axis=1))
     normals = (crosses[chosen] / areas[chosen, None]) @ truth.T_base_object.rotation.T
-    reachable = (points[:, 2] > _CLEARANCE_M) & (normals[:, 2] > -0.3) & _faces_outwards(points, normals, truth)
+    reachable = (
+        (points[:, 2] > _CLEARANCE_M) & (normals[:, 2] > -0.3) & _faces_outwards(points, normals, truth)
+    )
     points, normals = points[reachable], normals[reachable]
     for index in _farthest_first(np.hstack([points / mesh.diameter, _NORMAL_WEIGHT * normals])):
         yield points[index] + normals[index] * rng.normal(0, truth.touch_noise_m), normals[index]

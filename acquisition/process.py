@@ -1,8 +1,8 @@
-"""A simulated device as a process of its own: how it starts, takes commands, and ends with its parent.
+"""A child process that serves its parent: how it starts, takes commands, and ends with its parent.
 
-The two speak in lines of text. The simulator prints ``ready`` when it serves; after that, every line on its
-stdin is a command and is answered by one line, ``ok [text]`` or ``error text``. Its stdin reaching the end
-means that nobody needs it any more.
+Simulated devices run this way, and vendors' code that may hang or crash. The two speak in lines of text. The
+child prints ``ready`` when it serves; after that, every line on its stdin is a command and is answered by one
+line, ``ok [text]`` or ``error text``. Its stdin reaching the end means that nobody needs it any more.
 """
 
 import contextlib
@@ -28,10 +28,10 @@ _READY = "ready"
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-class SimulatorProcess:
-    """Runs ``python -m module arguments`` as a simulated device; a context manager that starts and stops it.
+class ChildProcess:
+    """Runs ``python -m module arguments``; a context manager that starts and stops it.
 
-    The process leads its own session, so that Ctrl-C in the terminal reaches the toolkit first and the device
+    The process leads its own session, so that Ctrl-C in the terminal reaches the toolkit first and a device
     outlives the clean-up of its clients.
     """
 
@@ -63,7 +63,7 @@ class SimulatorProcess:
 
     @property
     def pid(self) -> int:
-        """Process id. Raises DeviceError when the simulator was not started."""
+        """Process id. Raises DeviceError when it was not started."""
         return self._started().pid
 
     def start(self) -> None:
@@ -74,7 +74,7 @@ class SimulatorProcess:
         if self.running:
             raise DeviceError(f"{self.module} is already running; stop it before starting it again")
         self.stop()
-        # A file, not a pipe: nobody has to read it for the simulator to go on.
+        # A file, not a pipe: nobody has to read it for the child to go on.
         self._log = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115 - closed by stop()
         self._lines = queue.Queue()
         self._process = subprocess.Popen(
@@ -95,7 +95,7 @@ class SimulatorProcess:
     def command(self, line: str, timeout_s: float = 5.0) -> str:
         """Sends one command line and returns the text of its answer.
 
-        Raises DeviceError when the simulator refuses the command, has ended, or does not answer in time.
+        Raises DeviceError when the child refuses the command, has ended, or does not answer in time.
         """
         process = self._started()
         with self._lock:
@@ -115,7 +115,7 @@ class SimulatorProcess:
         return text
 
     def stop(self, timeout_s: float = 5.0) -> None:
-        """Closes the simulator's stdin and waits for its end; kills it when it does not end. Idempotent."""
+        """Closes the child's stdin and waits for its end; kills it when it does not end. Idempotent."""
         process, self._process = self._process, None
         if process is not None:
             with contextlib.suppress(BrokenPipeError):
@@ -137,11 +137,11 @@ class SimulatorProcess:
         process.wait()
 
     def stderr_tail(self, lines: int = 8) -> str:
-        """The last lines that the simulator wrote to its stderr, joined by ' | '."""
+        """The last lines that the child wrote to its stderr, joined by ' | '."""
         if self._log is None:
             return ""
         size = os.fstat(self._log.fileno()).st_size
-        # pread: the simulator writes through the same open file, whose position must not move.
+        # pread: the child writes through the same open file, whose position must not move.
         raw = os.pread(self._log.fileno(), 8192, max(0, size - 8192))
         text = raw.decode("utf-8", errors="replace").strip().splitlines()
         return " | ".join(part.strip() for part in text[-lines:] if part.strip())
@@ -181,7 +181,7 @@ class SimulatorProcess:
 
 
 def die_with_parent() -> None:
-    """Called first by a simulator: ends this process when the one that started it dies, however it dies."""
+    """Called first by a child: ends this process when the one that started it dies, however it dies."""
     parent = os.getppid()
 
     # The kernel sends the signal when the starting *thread* ends, which need not be the end of its process.
@@ -196,7 +196,7 @@ def die_with_parent() -> None:
 
 
 def serve_commands(handle: Callable[[str], str]) -> None:
-    """Called by a simulator that serves: announces ``ready``, answers command lines until stdin ends.
+    """Called by a child that serves: announces ``ready``, answers command lines until stdin ends.
 
     `handle` takes a command line and returns the text of the answer; a ToolkitError or ValueError that it
     raises becomes an ``error`` answer. Returns at the end of stdin or at Ctrl-C.

@@ -1,4 +1,4 @@
-"""A simulator starts, answers, fails with its own words, and never outlives the process that started it."""
+"""A child process starts, answers, fails with its own words, and never outlives its parent."""
 
 import os
 import signal
@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.simulation.process import SimulatorProcess
+from acquisition.process import ChildProcess
 from dataset.errors import DeviceError
 
 ECHO = """
 import sys, time
-from acquisition.simulation.process import die_with_parent, serve_commands
+from acquisition.process import die_with_parent, serve_commands
 die_with_parent()
 def handle(line):
     if line == "refuse":
@@ -62,7 +62,7 @@ def wait_until_dead(pid: int, timeout_s: float = 5.0) -> bool:
 
 
 def test_answers_commands_and_ends_with_the_context(module: Callable[[str], str]) -> None:
-    with SimulatorProcess(module(ECHO)) as peer:
+    with ChildProcess(module(ECHO)) as peer:
         assert peer.command("hello") == "HELLO"
         pid = peer.pid
     assert not alive(pid)
@@ -71,14 +71,14 @@ def test_answers_commands_and_ends_with_the_context(module: Callable[[str], str]
 
 
 def test_refused_command_says_why_and_the_peer_goes_on(module: Callable[[str], str]) -> None:
-    with SimulatorProcess(module(ECHO)) as peer:
+    with ChildProcess(module(ECHO)) as peer:
         with pytest.raises(DeviceError, match="refused the command 'refuse': not today"):
             peer.command("refuse")
         assert peer.command("on") == "ON"
 
 
 def test_late_answer_is_not_taken_for_the_next_one(module: Callable[[str], str]) -> None:
-    with SimulatorProcess(module(ECHO)) as peer:
+    with ChildProcess(module(ECHO)) as peer:
         with pytest.raises(DeviceError, match=r"more than 0\.1 s to answer 'think'"):
             peer.command("think", timeout_s=0.1)
         time.sleep(1.2)
@@ -86,7 +86,7 @@ def test_late_answer_is_not_taken_for_the_next_one(module: Callable[[str], str])
 
 
 def test_death_is_reported_with_exit_code_and_stderr(module: Callable[[str], str]) -> None:
-    with SimulatorProcess(module(ECHO)) as peer:
+    with ChildProcess(module(ECHO)) as peer:
         with pytest.raises(DeviceError, match=r"exit code 3.*out of steam"):
             peer.command("crash")
         peer.start()
@@ -94,21 +94,21 @@ def test_death_is_reported_with_exit_code_and_stderr(module: Callable[[str], str
 
 
 def test_start_reports_a_crash(module: Callable[[str], str]) -> None:
-    peer = SimulatorProcess(module("raise RuntimeError('port 3956 is taken')"))
+    peer = ChildProcess(module("raise RuntimeError('port 3956 is taken')"))
     with pytest.raises(DeviceError, match="port 3956 is taken"):
         peer.start()
     assert not peer.running
 
 
 def test_start_gives_up_on_a_silent_peer(module: Callable[[str], str]) -> None:
-    peer = SimulatorProcess(module("import time; time.sleep(60)"), ready_timeout_s=0.3)
+    peer = ChildProcess(module("import time; time.sleep(60)"), ready_timeout_s=0.3)
     with pytest.raises(DeviceError, match=r"more than 0\.3 s to be ready"):
         peer.start()
     assert not peer.running
 
 
 def test_kill_and_restart(module: Callable[[str], str]) -> None:
-    with SimulatorProcess(module(ECHO)) as peer:
+    with ChildProcess(module(ECHO)) as peer:
         peer.kill()
         assert not peer.running
         peer.start()
@@ -119,8 +119,8 @@ def test_kill_and_restart(module: Callable[[str], str]) -> None:
 def test_dies_when_its_parent_is_killed(module: Callable[[str], str], arguments: list[str]) -> None:
     name = module(ECHO)
     script = (
-        "import time\nfrom acquisition.simulation.process import SimulatorProcess\n"
-        f"peer = SimulatorProcess({name!r}, {arguments!r}); peer.start(); print(peer.pid, flush=True)\n"
+        "import time\nfrom acquisition.process import ChildProcess\n"
+        f"peer = ChildProcess({name!r}, {arguments!r}); peer.start(); print(peer.pid, flush=True)\n"
         "time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
@@ -132,7 +132,7 @@ def test_dies_when_its_parent_is_killed(module: Callable[[str], str], arguments:
 
 
 def test_outlives_the_thread_that_started_it(module: Callable[[str], str]) -> None:
-    peer = SimulatorProcess(module(ECHO))
+    peer = ChildProcess(module(ECHO))
     starter = threading.Thread(target=peer.start)
     starter.start()
     starter.join()

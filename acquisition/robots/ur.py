@@ -275,7 +275,7 @@ class UrRobot(Robot):
             low, high = self.config.workspace
             raise ToolkitError(
                 f"the motion would take the tool to ({x:.3f}, {y:.3f}, {z:.3f}) m, outside the workspace "
-                f"{low} to {high}; change the target, or [workspace] in the rig file"
+                f"{low} to {high}; change the target, or workspace under [robot] in the rig file"
             )
 
     def _inside(self, positions: Floats) -> NDArray[np.bool_]:

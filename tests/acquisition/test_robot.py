@@ -177,7 +177,9 @@ class TestMotion:
 
     def test_targets_outside_the_workspace_move_nothing(self, robot: UrRobot) -> None:
         pose = robot.sample().T_base_tcp
-        with pytest.raises(ToolkitError, match=r"outside the workspace .*rig file"):
+        with pytest.raises(
+            ToolkitError, match=r"outside the workspace .*workspace under \[robot\] in the rig file"
+        ):
             robot.move_linear(SE3(pose.rotation, pose.translation - [0, 0, 0.6]))
         with pytest.raises(ToolkitError, match="outside the workspace"):
             robot.move_joints(home_plus(0, 1.0, 0.5, 0, 0, 0))

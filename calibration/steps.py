@@ -31,6 +31,7 @@ from calibration.sessions import (
     read_points,
     time_offset_from_session,
     touched_points,
+    views_at_rest,
 )
 from dataset.session import Session
 
@@ -72,8 +73,9 @@ def add_hand_eye(
     assert known.intrinsics is not None
     with Session.open(session) as opened:
         found = detect_session(opened, spec, on_progress)
-        result = hand_eye_from_session(opened, spec, known.intrinsics, found)
-        pictures = _pictures(opened, found)
+        views, _ = views_at_rest(opened, found)  # the result counts these, not all that show the board
+        result = hand_eye_from_session(opened, spec, known.intrinsics, views)
+        pictures = _pictures(opened, views)
     record = HandEyeRecord.of(result, (Source.of(session),))
     known.merged(Calibration(board=spec, hand_eye=record)).save(calibration)
     html = calibration_report(spec, hand_eye=result, pictures=pictures, subtitle=str(session))
@@ -147,7 +149,7 @@ def report_path(calibration: Path, step: str) -> Path:
     return calibration.with_name(f"{calibration.stem}-{step}.html")
 
 
-def _pictures(session: Session, found: Detections) -> list[ViewPicture]:
-    """A few views spread over the session, to draw their corners on."""
-    chosen = np.unique(np.linspace(0, len(found) - 1, _PICTURES).astype(int))
-    return [ViewPicture(session.raw(found[view][0]), session.camera.mosaic, int(view)) for view in chosen]
+def _pictures(session: Session, views: Detections) -> list[ViewPicture]:
+    """A few of a result's views, spread over the session, to draw their corners on."""
+    chosen = np.unique(np.linspace(0, len(views) - 1, _PICTURES).astype(int))
+    return [ViewPicture(session.raw(views[view][0]), session.camera.mosaic, int(view)) for view in chosen]

@@ -85,7 +85,9 @@ ATTRIBUTES: tuple[Attribute, ...] = (
     Attribute("/objects/*", "symmetry", str, "Symmetries of the mesh, JSON"),
     Attribute("/objects/*", "diameter", float, "Largest distance between two vertices, metres"),
     Attribute("/objects/*", "sha256", str, "Of the vertices' bytes (float64) followed by the faces' (int32)"),
-    Attribute("/calibration", "sha256", str, "Of the text in /calibration/json, UTF-8"),
+    Attribute(
+        "/calibration", "sha256", str, "Of the text in /calibration/json, UTF-8, where it is", required=False
+    ),
 )
 
 DATASETS: tuple[Dataset, ...] = (

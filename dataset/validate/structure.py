@@ -22,7 +22,7 @@ def check_attributes(view: View) -> Iterator[Problem]:
             node = view.file.get(group)
             if isinstance(node, h5py.Group):
                 yield from _check_attribute(node, group, declared)
-            elif declared.required and "*" not in group and group != "/calibration":
+            elif declared.required and "*" not in group:
                 yield Problem(group, f"the group of the attribute {declared.name} is missing", _RERECORD)
 
 

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from dataset import CameraInfo, RawFrame
+from dataset import CameraInfo, Intrinsics, RawFrame
 from dataset.session import SessionWriter, compress
 from dataset.validate import info, mask_box, validate
 
@@ -21,6 +21,15 @@ def test_a_good_session_has_no_problem(recorded: Path) -> None:
 def test_an_empty_session_has_no_problem(tmp_path: Path, camera: CameraInfo) -> None:
     path = tmp_path / "s.h5"
     with SessionWriter(path, "hand_eye", camera):
+        pass
+    assert validate(path) == []
+
+
+def test_intrinsics_known_from_the_start_need_no_calibration_file(
+    tmp_path: Path, camera: CameraInfo, intrinsics: Intrinsics
+) -> None:
+    path = tmp_path / "s.h5"
+    with SessionWriter(path, "synthetic", camera, intrinsics=intrinsics):
         pass
     assert validate(path) == []
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from dataset.errors import ToolkitError
 from dataset.frames import Mosaic
-from dataset.polarimetry import Stokes, decode
+from dataset.polarimetry import Raw, Stokes, decode
 from s2p3.physics import shape_priors
 
 Picture = NDArray[np.uint8]
@@ -28,7 +29,8 @@ def intensity(stokes: Stokes) -> Picture:
 
 def degree(stokes: Stokes, full_scale: float = 1.0) -> Picture:
     """(h, w, 3) BGR picture of the DoLP, dark blue 0 to yellow `full_scale`."""
-    return cv2.applyColorMap(_to_bytes(np.clip(stokes.dolp / full_scale, 0, 1)), cv2.COLORMAP_VIRIDIS)
+    levels = _to_bytes(np.clip(stokes.dolp / full_scale, 0, 1))
+    return np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), np.uint8)
 
 
 def angle(stokes: Stokes) -> Picture:
@@ -37,7 +39,8 @@ def angle(stokes: Stokes) -> Picture:
     """
     hue = np.mod(stokes.aolp * (180 / np.pi), 180).astype(np.uint8)
     value = _to_bytes(np.sqrt(np.clip(stokes.dolp, 0, 1)))
-    return cv2.cvtColor(np.dstack([hue, np.full_like(hue, 220), value]), cv2.COLOR_HSV2BGR)
+    picture = np.dstack([hue, np.full_like(hue, 220), value])
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_HSV2BGR), np.uint8)
 
 
 def normals(directions: NDArray[np.floating], mask: NDArray[np.bool_] | None = None) -> Picture:
@@ -58,19 +61,12 @@ def decode_picture(raw: Path, layout: Mosaic, out: Path, index: float) -> list[P
         The files written: s0, dolp, aolp, normals_diffuse, normals_specular_1, normals_specular_2 (.png).
 
     Raises:
-        ToolkitError: no such image, or not a mosaic.
+        ToolkitError: no such image, not a mosaic of this layout, or an impossible index.
     """
-    pixels = cv2.imread(str(raw), cv2.IMREAD_UNCHANGED) if raw.exists() else None
-    if pixels is None:
-        raise ToolkitError(f"{raw} cannot be read as an image; give a PNG or TIFF of a raw mosaic.")
-    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+    pixels = _read_mosaic(raw)
+    if not 1 < index < math.inf:
         raise ToolkitError(
-            f"{raw} is not a raw mosaic: shape {pixels.shape}, {pixels.dtype}; "
-            "give a single-channel 8 or 16 bit image."
-        )
-    if index <= 1:
-        raise ToolkitError(
-            f"--index {index:g} is not a refractive index of something in air; give a number above 1."
+            f"--index {index:g} is not a refractive index of something in air; give a number above 1"
         )
     stokes = decode(pixels, layout, bits=_significant_bits(pixels))
     priors = prior_normals(stokes, nominal_camera_matrix(*stokes.shape), index)
@@ -98,7 +94,25 @@ def nominal_camera_matrix(height: int, width: int) -> NDArray[np.float64]:
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
 
 
-def _significant_bits(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> int:
+def _read_mosaic(path: Path) -> Raw:
+    """The pixels (H, W) of an image file, as they are stored."""
+    try:
+        coded = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise ToolkitError(f"{path} cannot be read ({error.strerror}); check the path") from error
+    pixels = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED) if coded.size else None
+    if pixels is None:
+        raise ToolkitError(f"{path} is not an image; give a PNG or TIFF of a raw mosaic")
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+        shape = " x ".join(map(str, pixels.shape))
+        raise ToolkitError(
+            f"{path} is not a raw mosaic but {shape} {pixels.dtype}; give an image of one channel, 8 or 16 bits"
+        )
+    mosaic: Raw = np.asarray(pixels, np.uint8 if pixels.dtype == np.uint8 else np.uint16)
+    return mosaic
+
+
+def _significant_bits(pixels: Raw) -> int:
     """8, 10, 12 or 16: the fewest that hold the brightest pixel; 16-bit files rarely say."""
     if pixels.dtype == np.uint8:
         return 8

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -87,14 +88,17 @@ class LabTruth:
 
     def save(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(asdict(self), indent=1))
+        path.write_text(json.dumps(asdict(self), indent=1), encoding="utf-8")
 
     @staticmethod
     def load(path: Path) -> LabTruth:
         try:
-            values = json.loads(path.read_text())
-            return LabTruth(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
-        except (OSError, ValueError, TypeError) as error:
+            values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            fields: dict[str, Any] = {
+                name: tuple(v) if isinstance(v, list) else v for name, v in values.items()
+            }
+            return LabTruth(**fields)
+        except (OSError, ValueError, TypeError, AttributeError) as error:
             raise ToolkitError(
                 f"{path} is not the truth of a simulated lab ({error}); start the lab afresh in a new folder."
             ) from error

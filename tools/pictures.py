@@ -1,0 +1,137 @@
+"""Regenerates the pictures of the documentation from the toolkit itself: `python tools/pictures.py`.
+
+`lab.png`: the simulated lab's cup as its camera measures it, 8 bit and noisy, with the physical priors and
+the true normals beside it. `objects.png`: the four built-in objects as the analytic synthesis draws them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from acquisition.trajectories import look_at
+from dataset import SE3, Intrinsics
+from dataset.polarimetry import Stokes, decode, remap, superpixel
+from s2p3 import objects, pictures
+from s2p3.lab.rig import BOARD
+from s2p3.lab.scene import LabScene
+from s2p3.lab.sensor import Sensor
+from s2p3.lab.truth import LabTruth, sample_truth
+from s2p3.pictures import Picture
+from s2p3.rendering import rasterize
+from s2p3.synthesis import SYNTHETIC, draw_frame
+from s2p3.synthesis.generate import BITS, PAPER_CAMERA
+from s2p3.synthesis.scene import expose
+
+IMAGES = Path(__file__).parents[1] / "docs" / "images"
+
+_SIDE, _GAP, _LINE = 150, 6, 28  # pixels of a tile, between tiles, of a line of text
+_INK, _PAPER = (70, 70, 70), 255
+_LAB_SEED = 0
+_LAB_EYE_M = (0.17, 0.15, 0.20)
+"""The camera in the cup's frame: a view that shows both handle and wall."""
+_EXPOSURE = 2.0
+"""Fraction of the white level that a white, well-lit surface reaches."""
+_FRAMES = {"cup": 8, "bottle": 5, "fork": 1, "knife": 4}
+"""Which frame of a set with seed 0 shows each object."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=IMAGES, help="folder for the pictures")
+    out = parser.parse_args().out
+    out.mkdir(parents=True, exist_ok=True)
+    for name, picture in (("lab.png", lab_picture()), ("objects.png", objects_picture())):
+        cv2.imwrite(str(out / name), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        print(f"{out / name}: {(out / name).stat().st_size // 1000} kB")
+
+
+def lab_picture() -> Picture:
+    """The lab's cup, measured: intensity, DoLP, AoLP, two of the priors, and the true normals."""
+    model = objects.build("cup")
+    board = (BOARD.squares_x * BOARD.square_m, BOARD.squares_y * BOARD.square_m)
+    truth = sample_truth(_LAB_SEED, model.name, model.refractive_index, board, model.resting)
+    T_base_cam = look_at(truth.T_base_object.apply(_LAB_EYE_M), truth.T_base_object.translation)
+    stokes, camera = measured(truth, T_base_cam)
+    raster = rasterize(model.mesh, T_base_cam.inverse() @ truth.T_base_object, camera)
+    diffuse, specular, _ = pictures.prior_normals(stokes, camera.K.copy(), model.refractive_index)
+    tiles = {
+        **polarization_tiles(stokes),
+        "prior, diffuse": pictures.normals(diffuse, raster.mask),
+        "prior, specular": pictures.normals(specular, raster.mask),
+        "true normals": pictures.normals(raster.normals, raster.mask),
+    }
+    row = [tile(picture, raster.mask) for picture in tiles.values()]
+    return np.vstack([line_of_text(list(tiles)), side_by_side(row)])
+
+
+def objects_picture() -> Picture:
+    """An object a row: intensity, DoLP, AoLP and true normals of one frame of a training set."""
+    rows, titles = [], []
+    for name, index in _FRAMES.items():
+        model = objects.build(name)
+        _, parameters, image, rng = draw_frame(model, PAPER_CAMERA, SYNTHETIC, 0, index)
+        stokes = decode(expose(image.stokes, parameters, BITS, rng), "mono", BITS)
+        normals = np.zeros((*stokes.shape, 3), np.float32)
+        normals[image.raster.window] = image.raster.normals
+        tiles = {**polarization_tiles(stokes), "true normals": pictures.normals(normals, image.mask)}
+        rows.append([tile(picture, image.mask) for picture in tiles.values()])
+        titles = list(tiles)
+    gap = np.full((_GAP, len(titles) * (_SIDE + _GAP) - _GAP, 3), _PAPER, np.uint8)
+    drawn = [strip for row in rows for strip in (side_by_side(row), gap)]
+    return np.vstack([line_of_text(titles), *drawn[:-1]])
+
+
+def measured(truth: LabTruth, T_base_cam: SE3) -> tuple[Stokes, Intrinsics]:
+    """What the lab's camera measures from a pose: the undistorted working image, and its pinhole camera."""
+    sensor = Sensor(truth.full_well, truth.read_noise, truth.dolp_scale)
+    radiance = LabScene(truth).render(T_base_cam)
+    mosaic = sensor.expose(radiance, _EXPOSURE, 8, True, np.random.default_rng(_LAB_SEED))
+    camera = truth.intrinsics.at(superpixel("colour"))
+    seen = decode(mosaic.astype(np.uint8), "colour", 8)
+    return remap(seen, *camera.undistort_map()), camera.pinhole
+
+
+def polarization_tiles(stokes: Stokes) -> dict[str, Picture]:
+    """Intensity, degree and angle of polarization."""
+    return {
+        "intensity": np.dstack([pictures.intensity(stokes)] * 3),
+        "degree (DoLP)": pictures.degree(stokes),
+        "angle (AoLP)": pictures.angle(stokes),
+    }
+
+
+def tile(picture: Picture, mask: NDArray[np.bool_]) -> Picture:
+    """A square of a picture around a mask, at the size of a tile."""
+    rows, columns = np.nonzero(mask)
+    half = int(0.62 * max(np.ptp(rows), np.ptp(columns)))
+    y, x = (int(axis.min() + axis.max()) // 2 for axis in (rows, columns))
+    framed = cv2.copyMakeBorder(picture, half, half, half, half, cv2.BORDER_REPLICATE)
+    square = framed[y : y + 2 * half, x : x + 2 * half]
+    method = cv2.INTER_AREA if 2 * half > _SIDE else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(square, (_SIDE, _SIDE), interpolation=method), np.uint8)
+
+
+def side_by_side(tiles: Sequence[Picture]) -> Picture:
+    """A row of tiles with gaps between them."""
+    gap = np.full((_SIDE, _GAP, 3), _PAPER, np.uint8)
+    return np.hstack([part for one in tiles for part in (one, gap)][:-1])
+
+
+def line_of_text(titles: Sequence[str]) -> Picture:
+    """A line with a title above each tile."""
+    line = np.full((_LINE, len(titles) * (_SIDE + _GAP) - _GAP, 3), _PAPER, np.uint8)
+    for column, title in enumerate(titles):
+        (width, _), _ = cv2.getTextSize(title, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+        at = (column * (_SIDE + _GAP) + (_SIDE - width) // 2, _LINE - 10)
+        cv2.putText(line, title, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA)
+    return line
+
+
+if __name__ == "__main__":
+    main()

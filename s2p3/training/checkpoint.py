@@ -59,7 +59,7 @@ def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
     description = {"format": FORMAT, **asdict(info), "config": typed_toml.dumps(info.config)}
     path.with_suffix(".json").write_text(json.dumps(description, indent=1), encoding="utf-8")
     save_tensors(path, weights)
-    shutil.copymode(path.with_suffix(".json"), path)  # safetensors writes files that only their owner can read
+    shutil.copymode(path.with_suffix(".json"), path)  # safetensors writes for the owner only
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:

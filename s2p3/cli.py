@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import tyro
@@ -13,40 +15,66 @@ from s2p3.commands import calibrate, capture, demo, devices, learn, sessions
 
 Verb = Callable[..., Any]
 
-VERBS: dict[str, Verb | dict[str, Verb]] = {
+
+@dataclass(frozen=True)
+class Group:
+    """Verbs that share a first word, and what they are for."""
+
+    purpose: str
+    verbs: dict[str, Verb]
+
+
+VERBS: dict[str, Verb | Group] = {
     "demo": demo.demo,
     "doctor": devices.doctor,
     "simulate": devices.simulate,
-    "capture": capture.capture,
-    "calibrate": {
-        "board": calibrate.board,
-        "intrinsics": calibrate.intrinsics,
-        "hand-eye": calibrate.hand_eye,
-        "time-offset": calibrate.time_offset,
-        "object": calibrate.object_pose,
-    },
+    "capture": Group(
+        "Record a session with the devices of a rig",
+        {
+            "intrinsics": capture.intrinsics,
+            "hand-eye": capture.hand_eye,
+            "board-motion": capture.board_motion,
+            "tool-tip": capture.tool_tip,
+            "sequence": capture.sequence,
+        },
+    ),
+    "calibrate": Group(
+        "Calibrate from recorded sessions; each result is added to calibration.json",
+        {
+            "board": calibrate.board,
+            "intrinsics": calibrate.intrinsics,
+            "hand-eye": calibrate.hand_eye,
+            "time-offset": calibrate.time_offset,
+            "object": calibrate.object_pose,
+        },
+    ),
     "annotate": sessions.annotate,
-    "dataset": {
-        "info": sessions.info,
-        "validate": sessions.validate,
-        "repair": sessions.repair,
-        "split": sessions.split,
-    },
+    "dataset": Group(
+        "Look into session files, check, repair and split them",
+        {
+            "info": sessions.info,
+            "validate": sessions.validate,
+            "repair": sessions.repair,
+            "split": sessions.split,
+        },
+    ),
     "decode": sessions.decode,
     "synthesize": learn.synthesize,
-    "train": {
-        "detector": learn.train_detector,
-        "teacher": learn.train_teacher,
-        "student": learn.train_student,
-        "self-supervised": learn.train_self_supervised,
-    },
+    "train": Group(
+        "Train the networks, on synthetic sessions first, then on captured ones",
+        {
+            "detector": learn.train_detector,
+            "teacher": learn.train_teacher,
+            "student": learn.train_student,
+            "self-supervised": learn.train_self_supervised,
+        },
+    ),
     "evaluate": learn.evaluate,
 }
 
 _DESCRIPTION = (
-    "From a polarization camera and a robot arm to a trained 6-D object pose model, "
-    "without annotating a single real image. "
-    "Start with `s2p3 demo`."
+    "From a polarization camera and a robot arm to a 6-D pose model, no real image annotated by hand.\n\n"
+    "Start with: s2p3 demo. Every verb and every group of verbs answers --help."
 )
 _USER_MISTAKE = 2
 _INTERRUPTED = 130
@@ -69,43 +97,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("s2p3: interrupted; what was recorded or trained so far is on disk", file=sys.stderr)
         return _INTERRUPTED
     except BrokenPipeError:
-        return 0
+        # Who read our output has gone; the interpreter must not find that out again when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"s2p3: {error.filename}: {error.strerror}; check the path and who may write", file=sys.stderr)
+        return _USER_MISTAKE
     return 0
 
 
 def _dispatch(words: list[str]) -> None:
     group = VERBS.get(words[0]) if words else None
-    if isinstance(group, dict):
-        _run(group, f"s2p3 {words[0]}", _summary(words[0], group), words[1:])
+    if isinstance(group, Group):
+        _run(group.verbs, f"s2p3 {words[0]}", f"{group.purpose}.", words[1:])
     else:
-        verbs = {name: _as_verb(name, verb) for name, verb in VERBS.items()}
-        _run(verbs, "s2p3", _DESCRIPTION, words)
+        _run({name: _as_verb(verb) for name, verb in VERBS.items()}, "s2p3", _DESCRIPTION, words)
 
 
 def _run(verbs: dict[str, Verb], prog: str, description: str, words: list[str]) -> None:
-    tyro.extras.subcommand_cli_from_dict(
-        verbs, prog=prog, description=description, args=words, config=(tyro.conf.FlagCreatePairsOff,)
-    )
+    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
+    tyro.extras.subcommand_cli_from_dict(verbs, prog=prog, description=description, args=words, config=config)
 
 
-def _as_verb(name: str, verb: Verb | dict[str, Verb]) -> Verb:
-    """A group appears in `s2p3 --help` as one line that names its verbs."""
-    if not isinstance(verb, dict):
+def _as_verb(verb: Verb | Group) -> Verb:
+    """A group appears in `s2p3 --help` as one entry that names its verbs."""
+    if not isinstance(verb, Group):
         return verb
 
     def group() -> None: ...
 
-    group.__doc__ = _summary(name, verb)
+    group.__doc__ = f"{verb.purpose}: {', '.join(verb.verbs)}."
     return group
-
-
-def _summary(name: str, group: dict[str, Verb]) -> str:
-    purpose = {
-        "calibrate": "From recorded sessions to intrinsics, hand-eye, clock offset and object poses",
-        "dataset": "Recorded sessions",
-        "train": "Detector, teacher and student, and the self-supervised stage",
-    }[name]
-    return f"{purpose}: {', '.join(group)}."
 
 
 if __name__ == "__main__":

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from s2p3.commands.output import console, show
+from s2p3.commands.arguments import ObjectName
+from s2p3.commands.output import console, say, show
 
 
 def demo(
     *,
     out: Path = Path("out/demo"),
     quick: bool = False,
-    object: str = "cup",
+    object: ObjectName = "cup",
     seed: int = 0,
     json: bool = False,
 ) -> None:
@@ -32,4 +33,4 @@ def demo(
         progress.run(job.steps(), console)
         result = job.report(progress.seconds)
     show(result, json)
-    console.print(f"[bold]{out / 'report.html'}[/bold] has the pictures, {out / 'result.json'} the numbers.")
+    say(f"{out / 'report.html'} has the pictures, {out / 'result.json'} the numbers")

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from pathlib import Path
 
-from s2p3.commands.output import console, show
+from rich.markup import escape
+
+from s2p3.commands.arguments import ObjectName, OptionalPath
+from s2p3.commands.output import console, say, show
 
 
-def doctor(*, rig: Path | None = None, json: bool = False) -> None:
+def doctor(*, rig: OptionalPath = None, json: bool = False) -> None:
     """Check what is installed, which device answers, the disk; each failing line says the fix.
 
     Args:
@@ -29,8 +33,9 @@ def doctor(*, rig: Path | None = None, json: bool = False) -> None:
         for check in checks:
             mark = "[green]ok  [/green]" if check.ok else "[red]FAIL[/red]"
             console.print(
-                f"{mark} {check.name}: {check.detail}"
-                + ("" if check.ok else f"  [bold]Fix:[/bold] {check.fix}")
+                f"{mark} {check.name}: {escape(check.detail)}"
+                + ("" if check.ok else f"  [bold]Fix:[/bold] {escape(check.fix)}"),
+                soft_wrap=True,
             )
     failed = [check.name for check in checks if not check.ok]
     if failed:
@@ -42,9 +47,9 @@ def doctor(*, rig: Path | None = None, json: bool = False) -> None:
 
 def simulate(
     *,
-    rig: Path | None = None,
+    rig: OptionalPath = None,
     lab: Path = Path("out/lab"),
-    object: str = "cup",
+    object: ObjectName = "cup",
     seed: int = 0,
 ) -> None:
     """Serve the simulated camera (GigE Vision) and arm (RTDE) until Ctrl-C, for any client.
@@ -61,8 +66,9 @@ def simulate(
     truth, rig_path = found_lab(lab, object, seed)
     devices = Rig.load(rig or rig_path)
     with running_lab(truth, devices):
-        console.print(
+        say(
             f"camera PHX050S-Q at {devices.camera.address} (GigE Vision), UR5e at {devices.robot.host} (RTDE)"
         )
-        console.print(f"try:  arv-tool-0.8    s2p3 doctor --rig {rig or rig_path}    Ctrl-C ends both")
-        threading.Event().wait()
+        say(f"try: arv-tool-0.8, or s2p3 doctor --rig {rig or rig_path}; Ctrl-C ends both")
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()

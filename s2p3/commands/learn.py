@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from s2p3.commands.output import console, counting, show
+from s2p3.commands.arguments import ObjectName, OptionalPath, Sessions
+from s2p3.commands.output import counting, say, show
 
 if TYPE_CHECKING:
     from s2p3.config import ExperimentConfig
@@ -17,17 +18,16 @@ Preset = Literal["fast", "paper", "quick"]
 
 def synthesize(
     *,
-    object: str,
+    object: ObjectName,
     count: int = 400,
     out: Path,
-    mesh: Path | None = None,
-    intrinsics: Path | None = None,
+    mesh: OptionalPath = None,
+    intrinsics: OptionalPath = None,
     seed: int = 0,
     workers: int = 2,
     backend: Literal["analytic"] = "analytic",
 ) -> None:
-    """Render a training set: polarized images of the object with exact poses and masks, as a session of kind
-    synthetic.
+    """Render a training set: polarized images of the object, with exact poses and masks.
 
     Args:
         object: cup, fork, knife, bottle, or the name of the object in --mesh.
@@ -36,8 +36,8 @@ def synthesize(
         mesh: PLY, OBJ or STL of the object, metres.
         intrinsics: calibration.json of the camera to imitate; the paper's camera by default.
         seed: the same seed, the same frames.
-        workers: processes.
-        backend: `analytic`: Fresnel reflection of lights and environment, without shadows.
+        workers: processes that render.
+        backend: analytic is Fresnel reflection of lights and environment, without shadows.
     """
     from s2p3.objects import named_object
     from s2p3.synthesis import session_camera
@@ -48,106 +48,117 @@ def synthesize(
         figures = render(
             named_object(object, mesh), count, session_camera(intrinsics), seed, out, workers, report
         )
-    console.print(f"{out}: {count} frames; {figures}")
+    say(f"{out}: {count} frames; {figures}")
 
 
 def train_detector(
-    sessions: tyro.conf.Positional[list[Path]],
+    sessions: Sessions,
     *,
-    object: str,
+    object: ObjectName,
     out: Path,
-    mesh: Path | None = None,
+    mesh: OptionalPath = None,
     preset: Preset = "fast",
-    config: Path | None = None,
+    config: OptionalPath = None,
 ) -> None:
     """Train the detector: the object's mask and box in the whole image.
 
     Args:
-        sessions: with poses and masks of the object, usually synthetic.
-        object: its name.
+        sessions: files with poses and masks of the object, usually synthetic.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
         out: folder for detector.safetensors and the log; an interrupted training continues.
-        mesh: PLY, OBJ or STL of an object of your own, metres.
-        preset: `fast` is our choice for two cores, `paper` the paper's values, `quick` a smoke test.
+        mesh: PLY, OBJ or STL of the object, metres.
+        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
         config: experiment.toml instead of a preset.
     """
     from s2p3.objects import named_object
     from s2p3.training import train_detector as train
 
-    console.print(str(train(sessions, named_object(object, mesh), _experiment(preset, config), out)))
+    say(str(train(_some(sessions), named_object(object, mesh), _experiment(preset, config), out)))
 
 
 def train_teacher(
-    sessions: tyro.conf.Positional[list[Path]],
+    sessions: Sessions,
     *,
-    object: str,
+    object: ObjectName,
     out: Path,
-    mesh: Path | None = None,
+    mesh: OptionalPath = None,
     preset: Preset = "fast",
-    config: Path | None = None,
+    config: OptionalPath = None,
     threads: int = 1,
 ) -> None:
     """Pre-train the teacher on synthetic sessions.
 
     Args:
-        sessions: with poses of the object, usually synthetic.
-        object: its name.
+        sessions: files with poses of the object, usually synthetic.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
         out: folder for teacher.safetensors and the log; an interrupted training continues.
-        mesh: PLY, OBJ or STL of an object of your own, metres.
-        preset: `fast` is our choice for two cores, `paper` the paper's values, `quick` a smoke test.
+        mesh: PLY, OBJ or STL of the object, metres.
+        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
         config: experiment.toml instead of a preset.
-        threads: of the CPU; one each when two trainings run side by side.
+        threads: CPU threads; one each when two trainings run side by side.
     """
     from s2p3.objects import named_object
     from s2p3.training import train_teacher as train
 
     _use_threads(threads)
-    console.print(
-        str(train(sessions, named_object(object, mesh), _experiment(preset, config), out, cache=out.parent))
+    say(
+        str(
+            train(
+                _some(sessions),
+                named_object(object, mesh),
+                _experiment(preset, config),
+                out,
+                cache=out.parent,
+            )
+        )
     )
 
 
 def train_student(
-    sessions: tyro.conf.Positional[list[Path]],
+    sessions: Sessions,
     *,
-    object: str,
+    object: ObjectName,
     out: Path,
-    mesh: Path | None = None,
-    teacher: Path | None = None,
+    mesh: OptionalPath = None,
+    teacher: OptionalPath = None,
     preset: Preset = "fast",
-    config: Path | None = None,
+    config: OptionalPath = None,
     threads: int = 1,
 ) -> None:
     """Pre-train the student on synthetic sessions.
 
     Args:
-        sessions: with poses of the object, usually synthetic.
-        object: its name.
+        sessions: files with poses of the object, usually synthetic.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
         out: folder for student.safetensors and the log; an interrupted training continues.
-        mesh: PLY, OBJ or STL of an object of your own, metres.
+        mesh: PLY, OBJ or STL of the object, metres.
         teacher: checkpoint to start the encoders from, where the experiment asks for a warm start.
-        preset: `fast` is our choice for two cores, `paper` the paper's values, `quick` a smoke test.
+        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
         config: experiment.toml instead of a preset.
-        threads: of the CPU; one each when two trainings run side by side.
+        threads: CPU threads; one each when two trainings run side by side.
     """
     from s2p3.objects import named_object
     from s2p3.training import train_student as train
 
     _use_threads(threads)
     model = named_object(object, mesh)
-    console.print(
-        str(train(sessions, model, _experiment(preset, config), out, cache=out.parent, teacher=teacher))
+    say(
+        str(
+            train(_some(sessions), model, _experiment(preset, config), out, cache=out.parent, teacher=teacher)
+        )
     )
 
 
 def train_self_supervised(
     session: tyro.conf.Positional[Path],
     *,
-    object: str,
+    object: ObjectName,
     detector: Path,
     teacher: Path,
     student: Path,
     out: Path,
-    mesh: Path | None = None,
+    mesh: OptionalPath = None,
+    config: OptionalPath = None,
     split: str = "train",
     threads: int = 2,
 ) -> None:
@@ -155,42 +166,46 @@ def train_self_supervised(
 
     Args:
         session: the captured sequence.
-        object: its name.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
         detector: detector.safetensors.
         teacher: teacher.safetensors.
         student: student.safetensors to start from.
-        out: folder for adapted.safetensors and the log.
-        mesh: PLY, OBJ or STL of an object of your own, metres.
-        split: frames to train on.
-        threads: of the CPU.
+        out: folder for adapted.safetensors and the log; an interrupted training continues.
+        mesh: PLY, OBJ or STL of the object, metres.
+        config: experiment.toml whose [self_supervision] to use instead of the student's.
+        split: name of the split to train on.
+        threads: CPU threads.
     """
+    from s2p3.config import load
     from s2p3.learning import adapt
     from s2p3.objects import named_object
 
     _use_threads(threads)
-    console.print(str(adapt(session, split, named_object(object, mesh), detector, teacher, student, out)))
+    model = named_object(object, mesh)
+    settings = None if config is None else load(config).self_supervision
+    say(str(adapt(session, split, model, detector, teacher, student, out, settings)))
 
 
 def evaluate(
     session: tyro.conf.Positional[Path],
     *,
-    object: str,
+    object: ObjectName,
     network: Path,
     detector: Path,
-    mesh: Path | None = None,
+    mesh: OptionalPath = None,
     split: str = "test",
-    out: Path | None = None,
+    out: OptionalPath = None,
     json: bool = False,
 ) -> None:
     """Evaluate a teacher or student on an annotated session, in detected boxes; every target counts.
 
     Args:
-        session: annotated.
-        object: its name.
+        session: an annotated session.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
         network: checkpoint of a teacher or student.
         detector: detector.safetensors.
-        mesh: PLY, OBJ or STL of an object of your own, metres.
-        split: frames to evaluate on.
+        mesh: PLY, OBJ or STL of the object, metres.
+        split: name of the split to evaluate on.
         out: JSON file for the summary and a record of every target.
         json: print the summary as JSON.
     """
@@ -203,6 +218,14 @@ def evaluate(
     if out is not None:
         result.save(out)
     show(asdict(result.summary), json)
+
+
+def _some(sessions: list[Path]) -> list[Path]:
+    from dataset.errors import ToolkitError
+
+    if not sessions:
+        raise ToolkitError("no session to train on; name one or more, made with: s2p3 synthesize")
+    return sessions
 
 
 def _experiment(preset: Preset, config: Path | None) -> ExperimentConfig:

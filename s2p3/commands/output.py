@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -21,6 +21,11 @@ console = Console(stderr=True, highlight=False)
 """For people. Results that a script would read go to stdout."""
 
 
+def say(text: str) -> None:
+    """A line for people, as it is: a path in it is neither wrapped nor taken for markup."""
+    console.print(text, markup=False, soft_wrap=True)
+
+
 @contextmanager
 def counting(label: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar with an ETA; call the yielded function with (done, in all)."""
@@ -30,7 +35,10 @@ def counting(label: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def counting_many(labels: Iterable[str]) -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar with an ETA for each label; call the yielded function with (label, done, in all)."""
+    """A progress bar with an ETA for each label; call the yielded function with (label, done, in all).
+
+    Nothing is shown before the first call: a mistake found until then is told in one line.
+    """
     columns = (
         TextColumn("  {task.description}"),
         BarColumn(),
@@ -38,10 +46,13 @@ def counting_many(labels: Iterable[str]) -> Iterator[Callable[[str, int, int], N
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console) as bar:
-        tasks = {label: bar.add_task(label, total=None) for label in labels}
+    bar = Progress(*columns, console=console)
+    tasks = {label: bar.add_task(label, total=None) for label in labels}
+    with ExitStack() as stack:
 
         def report(label: str, done: int, total: int) -> None:
+            if not bar.live.is_started:
+                stack.enter_context(bar)
             bar.update(tasks[label], completed=done, total=total)
 
         yield report

@@ -7,40 +7,42 @@ from typing import Literal
 
 import tyro
 
-from s2p3.commands.output import console, counting, show
+from s2p3.commands.arguments import ObjectName, OptionalPath
+from s2p3.commands.output import counting, say, show
 
 
 def annotate(
     session: tyro.conf.Positional[Path],
     *,
     calibration: Path,
-    object: str,
-    mesh: Path | None = None,
+    object: ObjectName,
+    mesh: OptionalPath = None,
 ) -> None:
-    """Write the object's pose, mask and box into every frame of a session, from the arm's forward kinematics.
+    """Write the object's pose, mask and box into every frame of a session, from the arm's motion.
 
     Args:
         session: the recorded sequence.
         calibration: calibration.json with intrinsics, hand-eye and the object's pose.
         object: cup, fork, knife, bottle, or the name of the object in --mesh.
-        mesh: PLY, OBJ or STL of the object, metres, with its material file beside it.
+        mesh: PLY, OBJ or STL of the object, metres.
     """
     from calibration import Calibration
     from s2p3.annotation import annotate as write_annotation
     from s2p3.objects import named_object
 
     model = named_object(object, mesh)
+    known = Calibration.load(calibration)
     with counting("annotate") as report:
-        done = write_annotation(session, Calibration.load(calibration), model, report)
-    console.print(f"{session}: {object} annotated in {done.frames} frames, visible in {done.visible}")
+        done = write_annotation(session, known, model, report)
+    say(f"{session}: {object} annotated in {done.frames} frames, visible in {done.visible}")
 
 
 def info(session: tyro.conf.Positional[Path], *, json: bool = False) -> None:
-    """Show what a session holds; costs the same however long it is.
+    """Show what a session holds.
 
     Args:
         session: the session file.
-        json: print JSON.
+        json: print it as JSON.
     """
     from dataclasses import asdict
 
@@ -54,7 +56,7 @@ def validate(session: tyro.conf.Positional[Path], *, json: bool = False) -> None
 
     Args:
         session: the session file.
-        json: print JSON.
+        json: print it as JSON.
     """
     from dataclasses import asdict
 
@@ -66,11 +68,12 @@ def validate(session: tyro.conf.Positional[Path], *, json: bool = False) -> None
         show({"problems": [asdict(problem) for problem in problems]}, as_json=True)
     else:
         for problem in problems:
-            console.print(f"{problem.where}: {problem.what}; {problem.hint}")
+            say(str(problem))
     if problems:
-        raise SessionError(f"{session}: {len(problems)} problems; each line above says what to do")
+        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        raise SessionError(f"{session}: {count}, listed above with what to do")
     if not json:
-        console.print(f"{session}: valid")
+        say(f"{session}: valid")
 
 
 def repair(session: tyro.conf.Positional[Path]) -> None:
@@ -81,7 +84,7 @@ def repair(session: tyro.conf.Positional[Path]) -> None:
     """
     from dataset.validate import repair as restore
 
-    console.print(str(restore(session)))
+    say(str(restore(session)))
 
 
 def split(
@@ -96,10 +99,10 @@ def split(
 
     Args:
         session: an annotated session.
-        by: `view` keeps views of nearly the same direction on one side; `frame` draws frames one by one.
-        train: share of the frames to train on (the paper: 15-20 %).
+        by: view keeps views of nearly the same direction on one side; frame draws frames one by one.
+        train: share of the frames to train on (the paper: 0.15 to 0.2).
         val: share to tune on.
-        seed: of the draw.
+        seed: the same seed, the same split.
     """
     from dataset.splits import split_session
 
@@ -120,7 +123,7 @@ def decode(
 
     Args:
         raw: a PNG or TIFF of the raw mosaic, 8 or 16 bit.
-        layout: `mono` (2x2 cells) or `colour` (4x4 super-pixels).
+        layout: mono has cells of 2x2 pixels, colour super-pixels of 4x4.
         out: folder for the pictures.
         index: refractive index assumed for the prior normals.
     """

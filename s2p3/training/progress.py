@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
+from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -30,7 +31,7 @@ def reporting(label: str, total: int, on_step: OnStep | None = None) -> Iterator
 
 @contextmanager
 def progress_bar(label: str, total: int) -> Iterator[OnStep]:
-    """A rich progress bar; yields the function that moves it."""
+    """A rich progress bar on stderr, from the first step on; yields the function that moves it."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -39,10 +40,13 @@ def progress_bar(label: str, total: int) -> Iterator[OnStep]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[values]}"),
     )
-    with Progress(*columns) as bar:
-        task = bar.add_task(label, total=total, values="")
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task(label, total=total, values="")
+    with ExitStack() as stack:
 
         def report(step: int, steps: int, values: dict[str, float]) -> None:
+            if not bar.live.is_started:
+                stack.enter_context(bar)
             shown = f"loss {values['total']:.3f}" if "total" in values else ""
             bar.update(task, completed=step, total=steps, values=shown)
 

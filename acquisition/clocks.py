@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize_scalar
 
 from dataset.errors import ToolkitError
 from dataset.frames import ClockFit
@@ -22,23 +23,22 @@ FEWEST_SAMPLES = 5
 _CRYSTAL_PPM = 50.0  # our choice: how far a device's rate is expected from the host's before the data speak
 _LARGEST_RATE_ERROR = 0.01  # beyond it the times are in another unit
 _LARGEST_SPAN_RATIO = 3.0  # of the whole capture on both clocks; late arrivals stretch a short one
-_ROUNDS = 30
-_TUKEY = 4.0  # scatters from the line at which a window's earliest sample is ignored as late
+_ROUNDS = 3
 
 
 def fit_clock(device_ns: ArrayLike, host_ns: ArrayLike) -> ClockFit:
     """The line host = a + b * device along the lower envelope of the arrivals.
 
-    The earliest arrival of each second, then a robust line through those; the rate is drawn towards 1 with
-    the accuracy of a crystal, which only shows where the capture lasts a few seconds.
+    The earliest arrival of each second, then the line that touches those from below; the rate is drawn
+    towards 1 with the accuracy of a crystal, which only shows where the capture lasts a few seconds.
 
     Args:
         device_ns: (N,) times on the device's clock, nanoseconds, strictly increasing.
         host_ns: (N,) when each was first seen, host monotonic nanoseconds; packets read together share one.
 
     Returns:
-        The fit. Its sigma is that of the earliest arrivals about the line: it bounds the jitter, and cannot
-        see a latency that is always there.
+        The fit. Its sigma is how much later than the line the earliest arrivals typically are: it bounds the
+        jitter, and cannot see a latency that is always there.
 
     Raises:
         ToolkitError: fewer than 5 samples, lengths that differ, times that do not increase, or clocks whose
@@ -52,7 +52,7 @@ def fit_clock(device_ns: ArrayLike, host_ns: ArrayLike) -> ClockFit:
         raise _other_unit(span_ratio)
     lateness = ((host - host[0]) - (device - device[0])).astype(np.float64)  # ns; small, so exact as a float
     times, earliest = _window_minima(elapsed, lateness)
-    centre, slope, scatter = _robust_line(times, earliest)
+    centre, slope, height = _lower_line(times, earliest)
     if abs(slope) > _LARGEST_RATE_ERROR * 1e9:
         raise _other_unit(1 + slope * 1e-9)
     b = 1.0 + slope * 1e-9
@@ -60,7 +60,7 @@ def fit_clock(device_ns: ArrayLike, host_ns: ArrayLike) -> ClockFit:
     middle = float(times.mean())
     offset_ns = int(host[0]) - int(device[0])
     a_ns = offset_ns + centre - slope * (middle + int(device[0]) * 1e-9)
-    return ClockFit(a_ns=float(a_ns), b=b, sigma_ns=scatter)
+    return ClockFit(a_ns=float(a_ns), b=b, sigma_ns=height)
 
 
 def _other_unit(ratio: float) -> ToolkitError:
@@ -99,26 +99,28 @@ def _window_minima(elapsed_s: Floats, lateness_ns: Floats) -> tuple[Floats, Floa
     return elapsed_s[chosen], lateness_ns[chosen]
 
 
-def _robust_line(times_s: Floats, values_ns: Floats) -> tuple[float, float, float]:
-    """The value at the mean time, the slope per second, and the scatter, by reweighted least squares."""
+def _lower_line(times_s: Floats, values_ns: Floats) -> tuple[float, float, float]:
+    """The value at the mean time, the slope per second, and the typical height of the values above the line.
+
+    The line that no value lies under and the values lie least above: the maximum of likelihood where lateness
+    is exponential. The crystal's accuracy keeps the slope of a short capture from following its jitter. For a
+    given slope the best value is the lowest that touches; what remains is convex in the slope.
+    """
     centred = times_s - times_s.mean()
-    value, slope = float(np.median(values_ns)), 0.0
-    if len(times_s) > 2:
-        i, j = np.triu_indices(len(times_s), k=1)
-        slope = float(np.median((values_ns[j] - values_ns[i]) / (times_s[j] - times_s[i])))  # Theil-Sen
-        value = float(np.median(values_ns - slope * centred))
+    prior = _CRYSTAL_PPM * 1e3  # ns per second
+
+    def touching(slope: float) -> float:
+        return float((values_ns - slope * centred).min())
+
+    scale, slope = float(np.median(values_ns) - values_ns.min()) + 1.0, 0.0
     for _ in range(_ROUNDS):
-        residual = values_ns - value - slope * centred
-        residual -= np.median(residual)  # where most lie on another line than the last, they pull it over
-        scatter = max(1.4826 * float(np.median(np.abs(residual))), 1.0)
-        weight = np.clip(1 - (residual / (_TUKEY * scatter)) ** 2, 0, None) ** 2
-        prior = (scatter / (_CRYSTAL_PPM * 1e3)) ** 2  # the rate is 0 +- 50 ppm, that is 50 000 ns per second
-        normal = np.array(
-            [
-                [weight.sum(), (weight * centred).sum()],
-                [(weight * centred).sum(), (weight * centred**2).sum() + prior],
-            ]
-        )
-        right = np.array([(weight * values_ns).sum(), (weight * centred * values_ns).sum()])
-        value, slope = (float(x) for x in np.linalg.solve(normal, right))
-    return value, slope, scatter
+        weight = len(values_ns) / scale
+
+        def cost(slope: float, weight: float = weight) -> float:
+            return -weight * touching(slope) + 0.5 * (slope / prior) ** 2
+
+        steepest = 2 * _LARGEST_RATE_ERROR * 1e9
+        found = minimize_scalar(cost, bounds=(-steepest, steepest), method="bounded", options={"xatol": 1.0})
+        slope = float(found.x)
+        scale = float(np.median(values_ns - slope * centred)) - touching(slope) + 1.0
+    return touching(slope), slope, scale

@@ -20,6 +20,7 @@ from dataset.pixel_formats import PixelFormat, unpack
 _BUFFERS = 12  # received while the grab thread waits for its turn: half a second at full rate
 _QUEUE = 16
 _POLL_US = 100_000
+_CLOCK_READINGS = 3
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ class FrameGrabber:
         size = settings.format.size(settings.height, settings.width)
         pixels = unpack(self._memory[buffer][:size], settings.format, settings.height, settings.width)
         # Aravis stamps the arrival of the first packet on the wall clock, which may be set at any time.
-        wall_to_monotonic_ns = time.monotonic_ns() - time.time_ns()
+        wall_to_monotonic_ns = _wall_to_monotonic_ns()
         return RawFrame(
             pixels=pixels,
             pixel_format=settings.format.name,
@@ -150,3 +151,13 @@ class FrameGrabber:
                 self._discarded += 1
             self._frames.append(frame)
             self._arrived.notify_all()
+
+
+def _wall_to_monotonic_ns() -> int:
+    """Host monotonic time minus wall time, by the quickest of a few readings: a thread may be interrupted
+    between two."""
+    readings = []
+    for _ in range(_CLOCK_READINGS):
+        before_ns, wall_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        readings.append((after_ns - before_ns, (before_ns + after_ns) // 2 - wall_ns))
+    return min(readings)[1]

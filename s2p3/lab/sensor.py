@@ -66,7 +66,7 @@ class Sensor:
         return out
 
 
-@numba.njit(cache=True, fastmath=True)
+@numba.njit(cache=True, fastmath=True, parallel=True)
 def _expose(  # pragma: no cover - compiled
     stokes: Image,
     signal: float,
@@ -82,11 +82,10 @@ def _expose(  # pragma: no cover - compiled
 ) -> None:
     _, height, width = stokes.shape
     mask = noise.size - 1
-    position = start
     per_electron = 1.0 / full_well
-    for i in range(height):
+    for i in numba.prange(height):
         # A new start on each row: consecutive frames and rows share no pattern.
-        position = (position + stride) & mask
+        position = (start + i * stride) & mask
         for j in range(width):
             channel = (i & 1) + (j & 1)
             amplitude = 0.5 * signal * gains[channel]

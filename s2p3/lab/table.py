@@ -53,10 +53,8 @@ def wood_texture(rng: np.random.Generator, size: int = 2048) -> Image:
 
 
 def _smooth_noise(rng: np.random.Generator, size: int, cells: int) -> Image:
-    noise: Image = cv2.resize(
-        rng.random((cells, cells), dtype=np.float32), (size, size), interpolation=cv2.INTER_CUBIC
-    )
-    return noise
+    coarse = rng.random((cells, cells), dtype=np.float32)
+    return np.asarray(cv2.resize(coarse, (size, size), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
 def render_table(table: Table, rays: Image, T_base_cam: SE3) -> Image:
@@ -103,7 +101,7 @@ def _bilinear(image: Image, x: float, y: float) -> float:  # pragma: no cover - 
     return top * (1 - a) + bottom * a
 
 
-@numba.njit(cache=True, fastmath=True)
+@numba.njit(cache=True, fastmath=True, parallel=True)
 def _render(  # pragma: no cover - compiled
     rays: Image,
     R_base: Image,
@@ -126,7 +124,7 @@ def _render(  # pragma: no cover - compiled
     board_x = board.shape[1] / board_size[0]
     board_y = board.shape[0] / board_size[1]
     step = 1.0 / _SUBSAMPLES
-    for i in range(height):
+    for i in numba.prange(height):
         for j in range(width):
             dx, dy, dz = rays[i, j, 0], rays[i, j, 1], rays[i, j, 2]
             cosine = -(nx * dx + ny * dy + nz * dz)

@@ -35,7 +35,6 @@ from s2p3.lab.scene import board_spec
 from s2p3.learning import adapt, evaluate_split
 from s2p3.side_by_side import Training, run_side_by_side
 from s2p3.synthesis import SYNTHETIC, Views, session_camera, synthesize
-from s2p3.training import labelled_crops, train_detector
 
 Step = tuple[str, str, Callable[[], None]]
 
@@ -146,8 +145,7 @@ class Demo:
             ("sequence", "film the object", self.film_object),
             ("annotate", "annotate every frame", self.annotate),
             ("synthesize", "synthesize training images", self.synthesize),
-            ("detector", "train the detector", self.train_detector),
-            ("networks", "train teacher and student on synthetic images", self.train_networks),
+            ("train", "train detector, teacher and student on synthetic images", self.train),
             ("self_supervise", "self-supervise on captured images, without their poses", self.self_supervise),
             ("evaluate", "evaluate on held-out captured images", self.evaluate),
         ]
@@ -203,24 +201,19 @@ class Demo:
             count, workers = self.plan.synthetic, _WORKERS
             synthesize(self.model, count, camera, self.seed, self.synthetic, workers, report, _DOMAIN)
 
-    def train_detector(self) -> None:
-        train_detector([self.synthetic], self.model, self.experiment, self.detector.parent)
-        labelled_crops([self.synthetic], self.model, self.experiment.input, self.out)
-
-    def train_networks(self) -> None:
-        """Teacher and student are trained side by side, a process and a thread each."""
+    def train(self) -> None:
+        """A process and a thread each: the teacher beside the detector, which the student follows."""
         common = (str(self.synthetic), "--object", self.model.name, "--preset", self.plan.preset, "--out")
+
+        def training(checkpoint: Path, steps: int, after: str | None = None) -> Training:
+            words = ("train", checkpoint.stem, *common, str(checkpoint.parent))
+            return Training(words, checkpoint.with_suffix(".log.jsonl"), steps, after)
+
         run_side_by_side(
             {
-                name: Training(
-                    ("train", name, *common, str(checkpoint.parent)),
-                    checkpoint.with_suffix(".log.jsonl"),
-                    settings.steps,
-                )
-                for name, checkpoint, settings in (
-                    ("teacher", self.teacher, self.experiment.teacher),
-                    ("student", self.student, self.experiment.student),
-                )
+                "detector": training(self.detector, self.experiment.detector.steps),
+                "teacher": training(self.teacher, self.experiment.teacher.steps),
+                "student": training(self.student, self.experiment.student.steps, after="detector"),
             }
         )
 
@@ -230,9 +223,10 @@ class Demo:
         )
 
     def evaluate(self) -> None:
-        for name, network in (("teacher", self.teacher), ("before", self.student), ("after", self.adapted)):
-            result = evaluate_split(self.sequence, "test", self.model, network, self.detector)
-            result.save(self._evaluation(name))
+        networks = {"teacher": self.teacher, "before": self.student, "after": self.adapted}
+        runs = evaluate_split(self.sequence, "test", self.model, networks, self.detector)
+        for name, run in runs.items():
+            run.save(self._evaluation(name))
 
     def report(self, seconds: dict[str, float]) -> dict[str, Any]:
         """Compares with the hidden truth, writes result.json and report.html, and returns the result."""

@@ -4,6 +4,7 @@ checkpoints.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from dataset.errors import SessionError
@@ -43,16 +44,22 @@ def adapt(
 
 
 def evaluate_split(
-    session: Path, split: str, model: ObjectModel, network: Path, detector: Path
-) -> Evaluation:
-    """Evaluates a network on a split of an annotated session, see `evaluation.evaluate`.
+    session: Path, split: str, model: ObjectModel, networks: Mapping[str, Path], detector: Path
+) -> dict[str, Evaluation]:
+    """Evaluates networks on a split of an annotated session, in the same detected boxes; see
+    `evaluation.evaluate`.
 
     Raises:
         SessionError: no such split, or the object was not annotated.
         ToolkitError: checkpoints of another object.
     """
     with Session.open(session) as opened:
-        return evaluate(opened, frames_of(opened, split), model, network, detector)
+        indices = frames_of(opened, split)
+        found = find_objects(opened, indices, detector, model.name)
+        return {
+            name: evaluate(opened, indices, model, network, detector, found)
+            for name, network in networks.items()
+        }
 
 
 def frames_of(session: Session, split: str) -> list[int]:

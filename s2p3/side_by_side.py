@@ -26,11 +26,13 @@ class Training:
         words: of the `s2p3` command line.
         log: JSON lines with a "step" that the training appends to.
         steps: how many it takes.
+        after: name of the training whose core it takes over when that one is done; None starts at once.
     """
 
     words: tuple[str, ...]
     log: Path
     steps: int
+    after: str | None = None
 
 
 def run_side_by_side(trainings: Mapping[str, Training]) -> None:
@@ -40,18 +42,21 @@ def run_side_by_side(trainings: Mapping[str, Training]) -> None:
         ToolkitError: one of them failed, with the last line it wrote; the others are stopped, and go on from
             their checkpoints next time.
     """
-    with ExitStack() as stack:
-        running = {name: _start(training, stack) for name, training in trainings.items()}
-        report = stack.enter_context(counting_many(trainings))
-        while True:
-            codes = {name: process.poll() for name, process in running.items()}
+    running: dict[str, subprocess.Popen[bytes]] = {}
+    done: set[str] = set()
+    with counting_many(trainings) as report, ExitStack() as stack:
+        while len(done) < len(trainings):
             for name, training in trainings.items():
-                report(name, training.steps if codes[name] == 0 else _last_step(training.log), training.steps)
-                if codes[name]:
-                    raise ToolkitError(f"{name}: training failed: {_last_words(_output(training))}")
-            if all(code == 0 for code in codes.values()):
-                return
+                if name not in running and (training.after is None or training.after in done):
+                    running[name] = _start(training, stack)
             time.sleep(_POLL_S)
+            for name, process in running.items():
+                training, code = trainings[name], process.poll()
+                if code:
+                    raise ToolkitError(f"{name}: training failed: {_last_words(_output(training))}")
+                if code == 0:
+                    done.add(name)
+                report(name, training.steps if code == 0 else _last_step(training.log), training.steps)
 
 
 def _start(training: Training, stack: ExitStack) -> subprocess.Popen[bytes]:

@@ -59,6 +59,7 @@ def train_detector(
     mesh: OptionalPath = None,
     preset: Preset = "fast",
     config: OptionalPath = None,
+    threads: int = 1,
 ) -> None:
     """Train the detector: the object's mask and box in the whole image.
 
@@ -69,10 +70,12 @@ def train_detector(
         mesh: PLY, OBJ or STL of the object, metres.
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
         config: experiment.toml instead of a preset.
+        threads: CPU threads; one each when two trainings run side by side.
     """
     from s2p3.objects import named_object
     from s2p3.training import train_detector as train
 
+    _use_threads(threads)
     say(str(train(_some(sessions), named_object(object, mesh), _experiment(preset, config), out)))
 
 
@@ -214,7 +217,8 @@ def evaluate(
     from s2p3.learning import evaluate_split
     from s2p3.objects import named_object
 
-    result = evaluate_split(session, split, named_object(object, mesh), network, detector)
+    networks = {"network": network}
+    result = evaluate_split(session, split, named_object(object, mesh), networks, detector)["network"]
     if out is not None:
         result.save(out)
     show(asdict(result.summary), json)

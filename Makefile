@@ -4,7 +4,7 @@ SHELL  := /bin/bash
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
-EXTRAS := aravis,harvesters,ur,synthesis,docs,dev
+EXTRAS := aravis,ur,docs,dev
 OUT    ?= out/demo
 
 .PHONY: demo quick test lint docs clean

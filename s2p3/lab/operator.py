@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +64,8 @@ class Operator(ChildProcess):
 def touch(truth: LabTruth, rig: Rig, count: int) -> Iterator[int]:
     """Touches `count` points spread over the object, one at a time, and yields how many it has touched."""
     T_tip_tcp = SE3.from_rotvec(np.zeros(3), -np.array(truth.tcp_tip))
-    with UrRobot(rig.robot) as arm:
+    by_hand = replace(rig.robot, speed=0.6, acceleration=2.0, joint_speed=2.0, joint_acceleration=5.0)
+    with UrRobot(by_hand) as arm:
         q = arm.sample().q
         touched = 0
         for point, normal in _contacts(truth, _CANDIDATES):

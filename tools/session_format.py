@@ -48,8 +48,8 @@ with Session.open("sequence.h5") as session:
 - The arm's trace is stored at the controller's rate, not one sample a frame.
 - A file whose writer was killed opens, says that it is incomplete, and `s2p3 dataset repair` restores every
   frame that had been flushed. Each frame has a checksum.
-- An older minor version always opens. A new major version comes with a converter; a toolkit that is older than
-  the file says so.
+- An older minor version always opens. A new major version comes with a converter; a toolkit older than the
+  file says so.
 
 Kinds: {", ".join(f"`{kind}`" for kind in KINDS)}.
 

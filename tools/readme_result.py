@@ -71,8 +71,9 @@ def command(settings: Mapping[str, Any]) -> str:
 
 
 def checked_out_commit() -> str:
-    """Short name of the commit, marked where tracked files differ from it."""
-    return _git("describe", "--always", "--abbrev=10", "--exclude=*", "--dirty= + uncommitted changes")
+    """Short name of the commit, marked where tracked files other than README.md differ from it."""
+    changed = _git("diff", "--name-only", "HEAD", "--", ".", ":(exclude)README.md")
+    return _git("rev-parse", "--short=10", "HEAD") + (" + uncommitted changes" if changed else "")
 
 
 def with_block(text: str, block: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dataset.compression import compress
 from dataset.errors import SessionError
@@ -92,7 +92,7 @@ def write_poses(
             _require(path, f"masks of {name}", (len(poses.masks),), (count,))
         if "poses" in file:
             del file["poses"]
-        _store(file, "poses/T_base_cam", T_base_cam.as_matrix())
+        _store(file, "poses/T_base_cam", _matrices(T_base_cam))
         _store(file, "poses/sigma_t", np.broadcast_to(sigma_t, (count,)))
         _store(file, "poses/sigma_r", np.broadcast_to(sigma_r, (count,)))
         for name, poses in objects.items():
@@ -158,7 +158,7 @@ def store_object(file: h5py.File, record: ObjectRecord) -> None:
 
 def _store_object_poses(file: h5py.File, path: Path, name: str, poses: ObjectPoses) -> None:
     columns = (
-        ("T_cam_obj", poses.T_cam_obj.as_matrix()),
+        ("T_cam_obj", _matrices(poses.T_cam_obj)),
         ("visible_fraction", poses.visible_fraction),
         ("bbox_xywh", poses.bbox_xywh),
     )
@@ -174,6 +174,13 @@ def _store_object_poses(file: h5py.File, path: Path, name: str, poses: ObjectPos
         mask = poses.mask(i)
         _require(path, f"mask {i} of {name}", mask.shape, size)
         stored.id.write_direct_chunk((i, 0, 0), compress(mask.view(np.uint8)).data)
+
+
+def _matrices(poses: SE3) -> NDArray[np.float64]:
+    """(N, 4, 4), wholly NaN where a pose is unknown."""
+    matrices = poses.as_matrix()
+    matrices[~poses.finite] = np.nan
+    return matrices
 
 
 def _store(file: h5py.File, declared_path: str, data: ArrayLike, name: str = "") -> None:

@@ -90,6 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         _dispatch(words)
+        sys.stdout.flush()
     except ToolkitError as error:
         print(f"s2p3: {error}", file=sys.stderr)
         return _USER_MISTAKE

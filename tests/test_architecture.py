@@ -148,6 +148,7 @@ def loaded_by(statement: str) -> list[str]:
     command = [sys.executable, "-c", LOADED, statement]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
+    assert "NO HELP" not in done.stdout
     return done.stdout.splitlines()[-1].split()[1:]
 
 
@@ -155,8 +156,20 @@ def test_the_command_line_starts_light() -> None:
     assert loaded_by("import s2p3.cli") == []
 
 
-def test_help_answers_without_torch() -> None:
-    assert "torch" not in loaded_by("import s2p3.cli; sys.argv = ['s2p3', '--help']; s2p3.cli.main()")
+ALL_HELP = """
+import contextlib
+from s2p3 import cli
+groups = {name: verb for name, verb in cli.VERBS.items() if isinstance(verb, cli.Group)}
+inner = [[name, verb] for name, group in groups.items() for verb in group.verbs]
+for words in [[], *([name] for name in cli.VERBS), *inner]:
+    with contextlib.suppress(SystemExit):
+        cli.main([*words, "--help"])
+        print("NO HELP", *words)
+"""
+
+
+def test_help_of_every_verb_answers_without_torch() -> None:
+    assert loaded_by(ALL_HELP) == []
 
 
 def test_loaded_packages_are_seen() -> None:

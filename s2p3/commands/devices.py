@@ -63,8 +63,9 @@ def simulate(
     from acquisition.rig import Rig
     from s2p3.lab import found_lab, running_lab
 
+    given = None if rig is None else Rig.load(rig)
     truth, rig_path = found_lab(lab, object, seed)
-    devices = Rig.load(rig or rig_path)
+    devices = given or Rig.load(rig_path)
     with running_lab(truth, devices):
         say(
             f"camera PHX050S-Q at {devices.camera.address} (GigE Vision), UR5e at {devices.robot.host} (RTDE)"

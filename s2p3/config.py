@@ -80,7 +80,7 @@ class NetworkConfig:
 class PretrainConfig:
     """Supervised training on synthetic sessions."""
 
-    steps: int = 2200
+    steps: int = 1300
     """Optimizer steps; with `epochs`, ignored."""
     epochs: int = 0
     """Passes through the data; 0: use `steps`."""
@@ -108,9 +108,9 @@ class DetectorConfig:
 
     level: int = 4
     """Down-sampling of the polarization image the detector sees."""
-    steps: int = 500
+    steps: int = 300
     batch: int = 8
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     weight_decay: float = 1e-2
     clip_norm: float = 5.0
     ema: float = 0.97

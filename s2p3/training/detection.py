@@ -135,7 +135,7 @@ def detector_losses(logits: Tensor, distances: Tensor, masks: Tensor) -> Losses:
     inside = (target.amax(1, keepdim=True) > 0.5).float()
     error = (distances - true_distances).abs().mean(1, keepdim=True) / side[:, None, None, None]
     box = (error * inside).sum() / (inside.sum() + 1)
-    return {"total": 4 * entropy + dice + 2 * box, "entropy": entropy, "dice": dice, "box": box}
+    return {"total": 4 * entropy + dice + 5 * box, "entropy": entropy, "dice": dice, "box": box}
 
 
 def box_distances(mask: Tensor, cells: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -79,7 +79,7 @@ class Evaluation:
             summary = Summary(**content["summary"])
             return Evaluation(summary, tuple(_record_from(row) for row in content["records"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ToolkitError(f"{path} is not a saved evaluation ({error}); run `s2p3 evaluate` again") from error
+            raise ToolkitError(f"{path} is no saved evaluation ({error}); evaluate again") from error
 
 
 def find_objects(
@@ -195,7 +195,8 @@ def _record(
 
 def _record_from(row: dict[str, Any]) -> Record:
     """A record as `Evaluation.save` wrote it; null stands for what was not finite."""
-    numbers = {name: float("nan") for name in ("rotation_deg", "translation_mm", "depth_mm") if row[name] is None}
+    errors = ("rotation_deg", "translation_mm", "depth_mm")
+    numbers = {name: float("nan") for name in errors if row[name] is None}
     if row["error_m"] is None:
         numbers["error_m"] = float("inf")
     return Record(**{**row, **numbers})

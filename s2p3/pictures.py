@@ -106,7 +106,7 @@ def _read_mosaic(path: Path) -> Raw:
     if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
         shape = " x ".join(map(str, pixels.shape))
         raise ToolkitError(
-            f"{path} is not a raw mosaic but {shape} {pixels.dtype}; give an image of one channel, 8 or 16 bits"
+            f"{path} is no raw mosaic but {shape} {pixels.dtype}; give an image of one channel, 8 or 16 bits"
         )
     mosaic: Raw = np.asarray(pixels, np.uint8 if pixels.dtype == np.uint8 else np.uint16)
     return mosaic

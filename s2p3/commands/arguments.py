@@ -1,4 +1,4 @@
-"""How arguments that several verbs share read in `--help`."""
+"""Arguments that several verbs share: how they read in `--help`, and what is asked of them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from dataset.errors import ToolkitError
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(optional)")]
 """A file that need not be given."""
@@ -17,3 +19,12 @@ Sessions = tyro.conf.Positional[
     Annotated[list[Path], tyro.conf.arg(metavar="SESSION [SESSION ...]", help_behavior_hint="(required)")]
 ]
 """One session or more."""
+
+
+def at_least(smallest: float, **values: float) -> None:
+    """Raises ToolkitError, naming the option, where one of the values is smaller."""
+    for name, value in values.items():
+        if not value >= smallest:
+            raise ToolkitError(
+                f"--{name.replace('_', '-')} {value:g} is too small; give at least {smallest:g}"
+            )

@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from s2p3.commands.arguments import ObjectName, OptionalPath
+from s2p3.commands.arguments import ObjectName, OptionalPath, at_least
 from s2p3.commands.output import counting, say
 
 if TYPE_CHECKING:
     from calibration import BoardSpec
+
+_FEWEST_PX_PER_SQUARE = 20
+"""Two pixels a marker's cell, or nearly."""
 
 
 def board(*, rig: Path, out: Path, px_per_square: int = 300) -> None:
@@ -28,6 +31,7 @@ def board(*, rig: Path, out: Path, px_per_square: int = 300) -> None:
 
     from calibration.board import draw
 
+    at_least(_FEWEST_PX_PER_SQUARE, px_per_square=px_per_square)
     _, picture = cv2.imencode(".png", draw(board_of(rig), px_per_square, margin_px=px_per_square // 2))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_bytes(picture.tobytes())

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from s2p3.commands.arguments import at_least
 from s2p3.commands.output import counting, say
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ def intrinsics(*, rig: Path, out: Path, views: int = 24) -> None:
     from acquisition.capture import capture_board
     from acquisition.rig import Rig
 
+    at_least(1, views=views)
     with recording("stills") as report:
         done = capture_board(Rig.load(rig), out, kind="intrinsics", views=views, on_progress=report)
     say(summary(out, done))
@@ -40,6 +42,7 @@ def hand_eye(*, rig: Path, out: Path, views: int = 24) -> None:
     from acquisition.capture import capture_board
     from acquisition.rig import Rig
 
+    at_least(1, views=views)
     with recording("stills") as report:
         done = capture_board(Rig.load(rig), out, kind="hand_eye", views=views, on_progress=report)
     say(summary(out, done))
@@ -56,6 +59,7 @@ def board_motion(*, rig: Path, out: Path, seconds: float = 14.0) -> None:
     from acquisition.capture import capture_board_motion
     from acquisition.rig import Rig
 
+    at_least(1, seconds=seconds)
     with recording("frames") as report:
         done = capture_board_motion(Rig.load(rig), out, seconds=seconds, on_progress=report)
     say(summary(out, done))
@@ -72,6 +76,7 @@ def tool_tip(*, rig: Path, out: Path, points: int = 24) -> None:
     from acquisition.capture import capture_touches
     from acquisition.rig import Rig
 
+    at_least(1, points=points)
     with recording("points") as report:
         done = capture_touches(Rig.load(rig), out, count=points, on_progress=report)
     say(f"{out}: {done.frames} points touched")
@@ -88,6 +93,7 @@ def sequence(*, rig: Path, out: Path, seconds: float = 60.0) -> None:
     from acquisition.capture import capture_sequence
     from acquisition.rig import Rig
 
+    at_least(1, seconds=seconds)
     with recording("frames") as report:
         done = capture_sequence(Rig.load(rig), out, seconds=seconds, on_progress=report)
     say(summary(out, done))

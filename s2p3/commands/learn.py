@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from s2p3.commands.arguments import ObjectName, OptionalPath, Sessions
+from s2p3.commands.arguments import ObjectName, OptionalPath, Sessions, at_least
 from s2p3.commands.output import counting, say, show
 
 if TYPE_CHECKING:
@@ -241,4 +241,5 @@ def _experiment(preset: Preset, config: Path | None) -> ExperimentConfig:
 def _use_threads(threads: int) -> None:
     import torch
 
+    at_least(1, threads=threads)
     torch.set_num_threads(threads)

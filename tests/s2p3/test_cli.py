@@ -256,6 +256,31 @@ def test_a_folder_nobody_may_write_to(fails: Fails, tmp_path: Path) -> None:
     assert "taken" in fails("decode", picture, "--layout", "mono", "--out", tmp_path / "taken")
 
 
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (["calibrate", "board", "--out", "b.png", "--px-per-square", "3"], "--px-per-square 3"),
+        (["capture", "intrinsics", "--out", "s.h5", "--views", "0"], "--views 0"),
+        (["capture", "sequence", "--out", "s.h5", "--seconds", "-1"], "--seconds -1"),
+        (["capture", "board-motion", "--out", "s.h5", "--seconds", "nan"], "--seconds nan"),
+        (["capture", "tool-tip", "--out", "s.h5", "--points", "0"], "--points 0"),
+    ],
+)
+def test_numbers_that_make_no_sense(fails: Fails, rig: Path, words: list[str], option: str) -> None:
+    assert f"{option} is too small; give at least" in fails(*words, "--rig", rig)
+
+
+def test_no_thread_to_train_on(fails: Fails, cup_session: Path, tmp_path: Path) -> None:
+    line = fails("train", "teacher", cup_session, "--object", "cup", "--out", tmp_path, "--threads", "0")
+    assert "--threads 0" in line
+
+
+def test_a_synthetic_set_that_exists_is_kept(fails: Fails, cup_session: Path) -> None:
+    before = cup_session.read_bytes()
+    assert str(cup_session) in fails("synthesize", "--object", "cup", "--out", cup_session)
+    assert cup_session.read_bytes() == before
+
+
 def test_touches_in_a_session_need_the_rig(fails: Fails, tmp_path: Path) -> None:
     assert "--rig" in fails("calibrate", "object", tmp_path / "touches.h5", "--object", "cup")
 

@@ -49,7 +49,7 @@ def tiny() -> ExperimentConfig:
     return dataclasses.replace(
         base,
         augmentation=still,
-        detector=dataclasses.replace(base.detector, steps=30, batch=4),
+        detector=dataclasses.replace(base.detector, steps=50, batch=4),
         teacher=pretrain,
         student=pretrain,
         self_supervision=dataclasses.replace(base.self_supervision, steps=4, batch=4, adapt_batches=1),

@@ -33,10 +33,19 @@ def add_s(estimated: SE3, true: SE3, points: Floats) -> Floats:
 
 
 def rotation_error_deg(estimated: SE3, true: SE3, symmetry: Symmetry) -> Floats:
-    """(N,) angle between the rotations, degrees: the smallest over the object's symmetries."""
-    wanted = true.rotation[:, None] @ symmetry.sampled()[None, :, :3, :3]
-    trace = np.einsum("nij,nmij->nm", estimated.rotation, wanted)
-    return np.degrees(np.arccos(np.clip((trace.max(axis=1) - 1) / 2, -1, 1)))
+    """(N,) angle between the rotations, degrees: the smallest over the object's symmetries.
+
+    The best turn about a continuous axis is taken exactly: it cancels the quaternion's part along that axis.
+    """
+    discrete = np.concatenate([np.eye(3)[None], symmetry.transforms[:, :3, :3]])
+    between = np.einsum("nji,njk,mlk->nmil", true.rotation, estimated.rotation, discrete)
+    quaternion = SE3(between, np.zeros((*between.shape[:2], 3))).as_quaternion()
+    vector, scalar = quaternion[..., :3], quaternion[..., 3]
+    if symmetry.axis is not None:
+        along = vector @ symmetry.axis
+        vector, scalar = vector - along[..., None] * symmetry.axis, np.hypot(scalar, along)
+    angle = 2 * np.arctan2(np.linalg.norm(vector, axis=-1), np.abs(scalar))
+    return np.degrees(angle.min(axis=1))
 
 
 def recall(errors: Floats, threshold: float) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dataset import SE3
+from dataset.transforms import rotation_error_deg
 from s2p3.evaluation import metrics
 from s2p3.evaluation.evaluate import Record, metric_name, summarize
 from s2p3.objects import ObjectModel, Symmetry, build
@@ -48,6 +49,18 @@ def test_rotation_error_forgives_symmetries() -> None:
     plain, round_ = Symmetry(), Symmetry(axis=np.array([0.0, 0.0, 1.0]))
     assert metrics.rotation_error_deg(turned, SE3.identity((1,)), plain)[0] == pytest.approx(30)
     assert metrics.rotation_error_deg(turned, SE3.identity((1,)), round_)[0] == pytest.approx(0, abs=1e-5)
+
+
+@pytest.mark.parametrize("around", [None, (0.0, 0.6, 0.8)])
+def test_rotation_error_is_the_smallest_over_all_symmetries(around: tuple[float, ...] | None) -> None:
+    half_turn = SE3.from_rotvec([np.pi, 0.0, 0.0], np.zeros(3)).as_matrix()
+    symmetry = Symmetry(half_turn[None], None if around is None else np.array(around))
+    estimated, true = poses(30), poses(30, seed=3)
+    found = metrics.rotation_error_deg(estimated, true, symmetry)
+    every = SE3.from_matrix(symmetry.sampled(3600))
+    tried = np.stack([rotation_error_deg(estimated[i], true[i] @ every).min() for i in range(30)])
+    np.testing.assert_allclose(found, tried, atol=0.06)
+    assert (found <= tried + 1e-6).all()
 
 
 def test_a_missed_target_counts_as_failed(cup: ObjectModel) -> None:

@@ -80,7 +80,7 @@ class NetworkConfig:
 class PretrainConfig:
     """Supervised training on synthetic sessions."""
 
-    steps: int = 1300
+    steps: int = 1150
     """Optimizer steps; with `epochs`, ignored."""
     epochs: int = 0
     """Passes through the data; 0: use `steps`."""
@@ -126,7 +126,7 @@ class DetectorConfig:
 class SelfSupervisionConfig:
     """Self-supervised training of the student on captured frames without poses."""
 
-    steps: int = 450
+    steps: int = 400
     """Optimizer steps; with `epochs`, ignored."""
     epochs: int = 0
     batch: int = 16

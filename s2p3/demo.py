@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.console import Console
 
 from acquisition.capture import capture_board, capture_board_motion, capture_sequence, capture_touches
@@ -59,7 +60,7 @@ class Plan:
     """Synthetic frames to train on."""
 
 
-FULL = Plan(preset="fast", board_views=24, motion_s=14.0, touches=40, sequence_s=120.0, synthetic=1400)
+FULL = Plan(preset="fast", board_views=24, motion_s=14.0, touches=40, sequence_s=110.0, synthetic=1200)
 QUICK = Plan(preset="quick", board_views=16, motion_s=8.0, touches=30, sequence_s=16.0, synthetic=96)
 
 
@@ -125,6 +126,8 @@ class Demo:
         self._truth, self._rig_path = found_lab(self.lab_folder, object_name, seed)
         self.rig = Rig.load(self._rig_path)
         self.experiment = PRESETS[plan.preset]()
+        # Two threads of one process fight as soon as anything else runs; one each is as fast on two cores.
+        torch.set_num_threads(1)
         self._devices = ExitStack()
         self._serving = False
 

@@ -9,6 +9,7 @@ from time import monotonic, sleep
 import numpy as np
 
 from acquisition.robots.rtde import RtdeReader
+from acquisition.simulation import kinematics
 from acquisition.simulation.controller import TRUE_TIME_VARIABLE
 from dataset.errors import DeviceError
 from dataset.transforms import SE3
@@ -21,13 +22,14 @@ class ArmPose:
     """Follows the simulated controller and answers with the flange's exact pose at a past moment.
 
     The simulated controller stamps each state with the true host time; that register exists for this reader
-    only, a real controller has none and the toolkit's driver does not read it.
+    only, a real controller has none and the toolkit's driver does not read it. The flange follows from the
+    joints, whatever tool the client has set.
     """
 
     def __init__(self, host: str, frequency_hz: float) -> None:
         self._host, self._frequency_hz = host, frequency_hz
         self._times: deque[float] = deque(maxlen=int(_KEPT_S * frequency_hz))
-        self._poses: deque[np.ndarray] = deque(maxlen=int(_KEPT_S * frequency_hz))
+        self._joints: deque[np.ndarray] = deque(maxlen=int(_KEPT_S * frequency_hz))
         self._lock = threading.Lock()
         threading.Thread(target=self._follow, daemon=True).start()
 
@@ -48,16 +50,12 @@ class ArmPose:
         )
 
     def _interpolate(self, time_s: float) -> SE3:
-        after = int(np.searchsorted(self._times, time_s))
-        if after == 0:
-            return SE3.from_pose6(self._poses[0])
-        before = after - 1
-        span = self._times[after] - self._times[before]
-        first, second = SE3.from_pose6(self._poses[before]), SE3.from_pose6(self._poses[after])
-        return first.interpolate(second, (time_s - self._times[before]) / span)
+        times, joints = np.array(self._times), np.array(self._joints)
+        q = [np.interp(time_s, times, angle) for angle in joints.T]
+        return kinematics.forward(np.array(q))
 
     def _follow(self) -> None:
-        variables = (TRUE_TIME_VARIABLE, "actual_TCP_pose")
+        variables = (TRUE_TIME_VARIABLE, "actual_q")
         while True:
             try:
                 with RtdeReader(self._host, variables, self._frequency_hz) as reader:
@@ -65,6 +63,6 @@ class ArmPose:
                         for package in np.frombuffer(b"".join(reader.packages()), reader.dtype):
                             with self._lock:
                                 self._times.append(float(package[TRUE_TIME_VARIABLE]))
-                                self._poses.append(np.array(package["actual_TCP_pose"], dtype=np.float64))
+                                self._joints.append(np.array(package["actual_q"], dtype=np.float64))
             except DeviceError:
                 sleep(0.2)  # the arm is being restarted

@@ -6,7 +6,9 @@ A process of its own: it knows where the object is, as eyes do; the toolkit only
 from __future__ import annotations
 
 import argparse
+import threading
 import time
+from _thread import interrupt_main
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 from acquisition.process import ChildProcess, die_with_parent, serve_commands
 from acquisition.rig import Rig
 from acquisition.robots.ur import UrRobot
+from dataset.errors import ToolkitError
 from dataset.transforms import SE3
 from s2p3 import objects
 from s2p3.lab.truth import LabTruth
@@ -40,6 +43,7 @@ class Operator(ChildProcess):
         arguments = ("--truth", str(truth_path), "--rig", str(rig_path), "--count", str(count))
         super().__init__("s2p3.lab.operator", arguments, ready_timeout_s=60.0)
         self._count = count
+        self._leaving = threading.Event()
 
     @contextmanager
     def touching(self) -> Iterator[None]:
@@ -50,14 +54,19 @@ class Operator(ChildProcess):
         """
         with ThreadPoolExecutor(1, "operator") as pool:
             work = pool.submit(self._touch_all)
+            # A recorder would wait for ever for a point that is not going to be touched.
+            work.add_done_callback(lambda done: interrupt_main() if done.exception() else None)
             try:
                 yield
             finally:
+                self._leaving.set()
                 if work.done():
                     work.result()
 
     def _touch_all(self) -> None:
         for _ in range(self._count):
+            if self._leaving.is_set():
+                return
             self.command("touch", timeout_s=60.0)
 
 
@@ -68,21 +77,25 @@ def touch(truth: LabTruth, rig: Rig, count: int) -> Iterator[int]:
     with UrRobot(by_hand) as arm:
         q = arm.sample().q
         touched = 0
-        for point, normal in _contacts(truth, _CANDIDATES):
-            contact = _tip_pose(point, normal) @ T_tip_tcp
-            retreat = SE3(contact.rotation, contact.translation - _RETREAT_M * contact.rotation[:, 2])
-            q_contact = arm.inverse_kinematics(contact, q)
-            q_retreat = None if q_contact is None else arm.inverse_kinematics(retreat, q_contact)
-            if q_contact is None or q_retreat is None or np.abs(q_contact - q).max() > np.pi:
-                continue
-            arm.follow(np.stack([q_retreat, q_contact]), blend=0.01)
-            time.sleep(_HOLD_S)
-            arm.follow(q_retreat[None])
-            q = q_retreat
-            touched += 1
-            yield touched
-            if touched == count:
-                return
+        while touched < count:
+            before = touched
+            for point, normal in _contacts(truth, _CANDIDATES):
+                contact = _tip_pose(point, normal) @ T_tip_tcp
+                retreat = SE3(contact.rotation, contact.translation - _RETREAT_M * contact.rotation[:, 2])
+                q_contact = arm.inverse_kinematics(contact, q)
+                q_retreat = None if q_contact is None else arm.inverse_kinematics(retreat, q_contact)
+                if q_contact is None or q_retreat is None or np.abs(q_contact - q).max() > np.pi:
+                    continue
+                arm.follow(np.stack([q_retreat, q_contact]), blend=0.01)
+                time.sleep(_HOLD_S)
+                arm.follow(q_retreat[None])
+                q = q_retreat
+                touched += 1
+                yield touched
+                if touched == count:
+                    return
+            if touched == before:
+                raise ToolkitError("the operator reaches no point of the object; try another --seed")
 
 
 def _contacts(truth: LabTruth, candidates: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:

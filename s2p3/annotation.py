@@ -15,8 +15,7 @@ import numpy as np
 
 from calibration import Calibration, camera_poses
 from dataset import SE3, CalibrationError, Intrinsics
-from dataset.session import ObjectPoses, Session, write_calibration, write_object, write_poses
-from dataset.validate import mask_box
+from dataset.session import ObjectPoses, Session, mask_box, write_calibration, write_object, write_poses
 from s2p3.objects import ObjectModel
 from s2p3.rendering.rasterizer import projected_region, rasterize
 

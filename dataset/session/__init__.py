@@ -3,7 +3,7 @@
 from dataset.compression import Chunk, compress
 from dataset.session.edit import write_calibration, write_object, write_poses, write_split
 from dataset.session.reader import Frame, Session
-from dataset.session.records import Clocks, ObjectPoses, ObjectRecord
+from dataset.session.records import Clocks, ObjectPoses, ObjectRecord, mask_box
 from dataset.session.writer import SessionWriter
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "Session",
     "SessionWriter",
     "compress",
+    "mask_box",
     "write_calibration",
     "write_object",
     "write_poses",

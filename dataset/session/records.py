@@ -78,3 +78,12 @@ class Clocks:
 
     camera: ClockFit | None
     robot: ClockFit | None
+
+
+def mask_box(mask: NDArray[np.generic]) -> NDArray[np.float64]:
+    """(4,) left, top, width, height of a mask (h, w) in pixel-edge coordinates; zeros where it is empty."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return np.zeros(4)
+    left, top = columns[0], rows[0]
+    return np.array([left, top, columns[-1] + 1 - left, rows[-1] + 1 - top], dtype=np.float64)

@@ -6,12 +6,11 @@ from pathlib import Path
 
 from dataset.session.files import READ_ERRORS, attribute, open_for_reading
 from dataset.validate import annotation, content, structure
-from dataset.validate.annotation import mask_box
 from dataset.validate.problems import Problem, View
 from dataset.validate.repair import RepairResult, repair
 from dataset.validate.summary import SessionInfo, info
 
-__all__ = ["Problem", "RepairResult", "SessionInfo", "info", "mask_box", "repair", "validate"]
+__all__ = ["Problem", "RepairResult", "SessionInfo", "info", "repair", "validate"]
 
 _CHECKS = (
     structure.check_attributes,

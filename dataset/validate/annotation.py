@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dataset.errors import CalibrationError
 from dataset.intrinsics import Intrinsics
 from dataset.session.files import READ_ERRORS, attribute
-from dataset.session.records import ObjectRecord
+from dataset.session.records import ObjectRecord, mask_box
 from dataset.validate.problems import Problem, View, first_frames
 
 _ORTHONORMAL = 1e-4
@@ -142,12 +142,3 @@ def _check_masks(view: View, where: str) -> Iterator[Problem]:
         if mask.any() and not np.abs(boxes[index] - expected).max() <= _BOX_TOLERANCE_PX:
             what = f"{np.round(boxes[index], 2).tolist()} is not the box {expected.tolist()} of the mask"
             yield Problem(f"{where}/bbox_xywh[{index}]", what, _ANNOTATE)
-
-
-def mask_box(mask: NDArray[np.generic]) -> NDArray[np.float64]:
-    """(4,) left, top, width, height of a mask (h, w) in pixel-edge coordinates; zeros where it is empty."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if len(rows) == 0:
-        return np.zeros(4)
-    left, top = columns[0], rows[0]
-    return np.array([left, top, columns[-1] + 1 - left, rows[-1] + 1 - top], dtype=np.float64)

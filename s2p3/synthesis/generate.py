@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dataset import SE3, CameraInfo, Intrinsics, RawFrame, SessionError, ToolkitError
 from dataset.polarimetry import decode
-from dataset.session import Chunk, ObjectPoses, SessionWriter, compress, write_object, write_poses
+from dataset.session import Chunk, ObjectPoses, SessionWriter, compress, mask_box, write_object, write_poses
 from s2p3.objects import ObjectModel
 from s2p3.synthesis.domain import SYNTHETIC, Domain, draw_scene, draw_view
 from s2p3.synthesis.informativeness import Informativeness, measure
@@ -207,8 +207,6 @@ def _render_part(job: _Job, index: int) -> None:
     raw = expose(image.stokes, parameters, BITS, rng)
     chunk = compress(raw)
     figures = _measure(job, image, raw, index) if index < _MEASURED else None
-    rows, columns = np.nonzero(image.mask)
-    low, high = (columns.min(), rows.min()), (columns.max() + 1, rows.max() + 1)
     unfinished = job.part(index).with_suffix(".tmp")
     with unfinished.open("wb") as file:
         np.savez(
@@ -217,7 +215,7 @@ def _render_part(job: _Job, index: int) -> None:
             crc32=chunk.crc32,
             T_cam_obj=T_cam_obj.as_matrix(),
             visible_fraction=image.visible_fraction,
-            bbox_xywh=np.array([*low, high[0] - low[0], high[1] - low[1]], dtype=np.float64),
+            bbox_xywh=mask_box(image.mask),
             mask=np.packbits(image.mask),
             figures=np.array([] if figures is None else figures.values()),
         )

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from dataset import SE3, Intrinsics
 from dataset.errors import ToolkitError
-from dataset.session import Session
+from dataset.session import Session, mask_box
 from s2p3.config import InputConfig
 from s2p3.inputs import crop_intrinsics, extract_crop, square_box
 from s2p3.networks.detector import Detection
@@ -157,13 +157,6 @@ def single_crop(
     """The crop (N = 1) of one undistorted Stokes image (3, H, W) at a predicted box."""
     row = _crop(stokes, found.mask, found.box_xywh, intrinsics, config, 0)
     return Crops(**{name: torch.from_numpy(value[None]) for name, value in row.items()})
-
-
-def mask_box(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(4,) box x, y, w, h of a mask (H, W), pixel-edge coordinates. The mask must not be empty."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    left, top = columns[0], rows[0]
-    return np.array([left, top, columns[-1] + 1 - left, rows[-1] + 1 - top], dtype=np.float64)
 
 
 def canonical_pose(pose: SE3, symmetry: Symmetry) -> SE3:

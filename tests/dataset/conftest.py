@@ -14,12 +14,12 @@ from dataset.session import (
     ObjectPoses,
     ObjectRecord,
     SessionWriter,
+    mask_box,
     write_calibration,
     write_object,
     write_poses,
     write_split,
 )
-from dataset.validate import mask_box
 
 HEIGHT, WIDTH, FRAMES = 32, 48, 12
 

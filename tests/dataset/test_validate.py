@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dataset import CameraInfo, Intrinsics, RawFrame
-from dataset.session import SessionWriter, compress
-from dataset.validate import info, mask_box, validate
+from dataset.session import SessionWriter, compress, mask_box
+from dataset.validate import info, validate
 
 
 def test_a_good_session_has_no_problem(recorded: Path) -> None:

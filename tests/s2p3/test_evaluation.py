@@ -13,7 +13,7 @@ import pytest
 from calibration import html
 from dataset import SE3
 from dataset.errors import ToolkitError
-from dataset.session import Session
+from dataset.session import Session, mask_box
 from s2p3 import config as presets
 from s2p3.evaluation import Estimator, Evaluation, Finder, evaluate, find_objects
 from s2p3.evaluation.evaluate import Record, summarize
@@ -22,7 +22,6 @@ from s2p3.networks.detector import Detection, Detector
 from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
 from s2p3.training.checkpoint import CheckpointInfo, Kind
-from s2p3.training.crops import mask_box
 from s2p3.training.pretrain import build_student
 
 

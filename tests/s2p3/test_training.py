@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from dataset import SE3
 from dataset.errors import ToolkitError
-from dataset.session import Session
+from dataset.session import Session, mask_box
 from s2p3 import config as presets
 from s2p3.config import AugmentationConfig, ExperimentConfig
 from s2p3.inputs import View
@@ -36,7 +36,7 @@ from s2p3.training import (
     train_teacher,
 )
 from s2p3.training.batches import form_input, form_targets
-from s2p3.training.crops import canonical_pose, mask_box
+from s2p3.training.crops import canonical_pose
 from s2p3.training.detection import box_distances, detector_losses
 from s2p3.training.pretrain import load_student, load_teacher
 from s2p3.training.pseudo_labels import carry_labels, make_labels

@@ -183,9 +183,12 @@ class UrRobot(Robot):
 
     def stop(self) -> None:
         self._stop_requested.set()
-        with self._moving:  # the thread in the move sees the request and ends it
+        try:
+            # The thread in a move sees the request and ends it; until the arm rests, no other begins.
+            with self._moving:
+                self.wait_until_still()
+        finally:
             self._stop_requested.clear()
-        self.wait_until_still()
 
     def _move(self, target: Floats | SE3, verb: str, **arguments: object) -> None:
         """Starts a motion and waits for its end."""

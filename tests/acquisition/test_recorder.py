@@ -293,7 +293,7 @@ def test_a_lost_arm_keeps_frames_and_poses_until_then(tmp_path: Path, camera: Ar
 
 
 RECORD = """
-import json, sys
+import json, signal, sys
 import numpy as np
 from acquisition.camera import CameraConfig
 from acquisition.cameras.aravis import AravisCamera
@@ -302,6 +302,7 @@ from acquisition.robot import RobotConfig
 from acquisition.robots.ur import UrRobot
 from dataset.session import SessionWriter
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the suite runs in the background
 arguments = json.loads(sys.argv[1])
 path = np.tile(np.array(arguments["path"]), (20, 1))
 robot_config = RobotConfig(arguments["host"], tcp_offset=(0.0,) * 6, joint_acceleration=4.0)

@@ -227,10 +227,10 @@ def quick() -> ExperimentConfig:
     base = fast()
     return dataclasses.replace(
         base,
-        detector=dataclasses.replace(base.detector, steps=60),
-        teacher=dataclasses.replace(base.teacher, steps=80),
-        student=dataclasses.replace(base.student, steps=80),
-        self_supervision=dataclasses.replace(base.self_supervision, steps=30, adapt_batches=5),
+        detector=dataclasses.replace(base.detector, steps=40),
+        teacher=dataclasses.replace(base.teacher, steps=50),
+        student=dataclasses.replace(base.student, steps=50),
+        self_supervision=dataclasses.replace(base.self_supervision, steps=20, adapt_batches=5),
     )
 
 

@@ -97,7 +97,7 @@ def children(pid):
     tasks = pathlib.Path(f"/proc/{pid}/task").glob("*/children")
     return [int(child) for task in tasks for child in task.read_text().split()]
 
-signal.signal(signal.SIGINT, signal.SIG_DFL)  # a suite in the background ignores it, and so would its children
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # a suite in the background ignores it, and its children too
 command = [sys.executable, "-m", "s2p3.cli", "simulate", "--seed", "3", "--lab", sys.argv[1]]
 simulate = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
 said = [simulate.stderr.readline()]

@@ -61,7 +61,7 @@ class Plan:
 
 
 FULL = Plan(preset="fast", board_views=24, motion_s=14.0, touches=40, sequence_s=110.0, synthetic=1200)
-QUICK = Plan(preset="quick", board_views=14, motion_s=8.0, touches=24, sequence_s=14.0, synthetic=64)
+QUICK = Plan(preset="quick", board_views=14, motion_s=8.0, touches=30, sequence_s=14.0, synthetic=64)
 
 
 _WORKERS = 2

@@ -4,7 +4,7 @@ SHELL  := /bin/bash
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
-EXTRAS := aravis,ur,docs,dev
+EXTRAS := aravis,harvesters,ur,objects,synthesis,train,console,cluster,docs,dev
 OUT    ?= out/demo
 
 .PHONY: demo quick test lint docs clean

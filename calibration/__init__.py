@@ -5,8 +5,7 @@ from calibration.detection import Detection, detect, detect_in_mosaic
 from calibration.hand_eye import HandEyeResult, calibrate_hand_eye
 from calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
 from calibration.object_pose import ObjectPoseResult, register_points
-from calibration.result import (
-    Calibration,
+from calibration.records import (
     HandEyeRecord,
     IntrinsicsRecord,
     ObjectPoseRecord,
@@ -14,15 +13,16 @@ from calibration.result import (
     TimeOffsetRecord,
     ToolTipRecord,
 )
+from calibration.result import Calibration
 from calibration.sessions import (
     camera_poses,
     detect_session,
     hand_eye_from_session,
     intrinsics_from_session,
-    object_from_touches,
     time_offset_from_session,
 )
 from calibration.time_offset import TimeOffsetResult, estimate_time_offset
+from calibration.touches import object_from_touches
 
 __all__ = [
     "BoardSpec",

@@ -13,26 +13,25 @@ from numpy.typing import ArrayLike
 
 from calibration.board import BoardSpec
 from calibration.object_pose import register_points
-from calibration.report import TouchedObject, ViewPicture, calibration_report
-from calibration.result import (
-    Calibration,
+from calibration.records import (
     HandEyeRecord,
     IntrinsicsRecord,
     ObjectPoseRecord,
     Source,
     TimeOffsetRecord,
 )
+from calibration.report import TouchedObject, ViewPicture, calibration_report
+from calibration.result import Calibration
 from calibration.sessions import (
     Detections,
     Progress,
     detect_session,
     hand_eye_from_session,
     intrinsics_from_session,
-    read_points,
     time_offset_from_session,
-    touched_points,
     views_at_rest,
 )
+from calibration.touches import read_points, touched_points
 from dataset.session import Session
 
 _PICTURES = 3

@@ -26,7 +26,7 @@ from acquisition.simulation.camera import SimulatedCamera
 from acquisition.simulation.kinematics import forward
 from acquisition.simulation.patterns import MovingPattern
 from acquisition.simulation.robot import SimulatedRobot
-from calibration.sessions import touched_points
+from calibration.touches import touched_points
 from dataset.errors import DeviceError, SessionError, ToolkitError
 from dataset.frames import RawFrame, RobotTrace
 from dataset.rests import find_rests

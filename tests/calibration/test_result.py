@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from calibration.result import (
-    Calibration,
+from calibration.records import (
     HandEyeRecord,
     IntrinsicsRecord,
     ObjectPoseRecord,
@@ -14,6 +13,7 @@ from calibration.result import (
     TimeOffsetRecord,
     ToolTipRecord,
 )
+from calibration.result import Calibration
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3
 

@@ -16,7 +16,8 @@ from calibration import (
     intrinsics_from_session,
 )
 from calibration.report import ViewPicture, calibration_report
-from calibration.sessions import arm_trace, read_points, rest_pose, touched_points
+from calibration.sessions import arm_trace, rest_pose
+from calibration.touches import read_points, touched_points
 from dataset.errors import CalibrationError
 from dataset.session import Session
 from dataset.transforms import rotation_error_deg, translation_error_mm

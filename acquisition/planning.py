@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acquisition.simulation.kinematics import JOINT_LIMIT, inverse_all, link_transforms, unwrap_near
+from acquisition.kinematics import JOINT_LIMIT, inverse_all, link_transforms, unwrap_near
 from dataset.errors import ToolkitError
 from dataset.transforms import SE3
 

@@ -13,10 +13,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from acquisition.kinematics import forward
 from acquisition.robot import MotionStopped, PoseSource, Robot, RobotConfig
 from acquisition.robots.motion_client import MotionClient
 from acquisition.robots.stream import RtdeStream
-from acquisition.simulation.kinematics import forward
 from dataset.errors import DeviceError, ToolkitError
 from dataset.frames import RobotSample, RobotTrace
 from dataset.transforms import SE3, rotation_error_deg

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from acquisition.simulation.kinematics import JOINT_LIMIT, link_transforms
+from acquisition.kinematics import JOINT_LIMIT, link_transforms
 from acquisition.simulation.motion import Motion
 from dataset.transforms import SE3
 

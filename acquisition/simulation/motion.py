@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acquisition.simulation.kinematics import (
+from acquisition.kinematics import (
     JOINT_SPEED_LIMIT,
     forward,
     inverse_all,

@@ -14,8 +14,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from acquisition.kinematics import JOINT_LIMIT, forward, inverse
 from acquisition.simulation.arm import Arm, Registers
-from acquisition.simulation.kinematics import JOINT_LIMIT, forward, inverse
 from acquisition.simulation.motion import (
     JointSpeed,
     Motion,

@@ -8,8 +8,8 @@ from time import monotonic, sleep
 
 import numpy as np
 
+from acquisition import kinematics
 from acquisition.robots.rtde import RtdeReader
-from acquisition.simulation import kinematics
 from acquisition.simulation.controller import TRUE_TIME_VARIABLE
 from dataset.errors import DeviceError
 from dataset.transforms import SE3

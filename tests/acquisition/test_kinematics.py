@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquisition.simulation.kinematics import forward, inverse, inverse_all, jacobian, link_transforms
+from acquisition.kinematics import forward, inverse, inverse_all, jacobian, link_transforms
 from dataset.transforms import SE3, rotation_error_deg, translation_error_mm
 
 TRANSLATION = [-0.567723093, -0.379956175, 0.430607992]

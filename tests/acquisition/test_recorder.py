@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from acquisition.camera import CameraConfig
 from acquisition.cameras.aravis import AravisCamera
 from acquisition.frame_stream import UNKNOWN_FRAME_ID
+from acquisition.kinematics import forward
 from acquisition.recorder import NO_CAMERA, Progress, record_stills, record_stream, record_touches
 from acquisition.robot import RobotConfig
 from acquisition.robots.rtde import RtdeReader
 from acquisition.robots.ur import UrReceiver, UrRobot
 from acquisition.simulation.camera import SimulatedCamera
-from acquisition.simulation.kinematics import forward
 from acquisition.simulation.patterns import MovingPattern
 from acquisition.simulation.robot import SimulatedRobot
 from calibration.touches import touched_points

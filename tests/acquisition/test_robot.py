@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from acquisition.clocks import fit_clock
+from acquisition.kinematics import forward
 from acquisition.robot import EmergencyStop, MotionStopped, ProtectiveStop, RobotConfig
 from acquisition.robots.stream import safety_error
 from acquisition.robots.ur import UrReceiver, UrRobot
-from acquisition.simulation.kinematics import forward
 from acquisition.simulation.robot import SimulatedRobot
 from dataset.errors import DeviceError, ToolkitError
 from dataset.frames import RobotTrace

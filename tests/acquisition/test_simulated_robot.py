@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from acquisition.kinematics import forward
 from acquisition.robots.rtde import RtdeReader
 from acquisition.simulation.controller import TRUE_TIME_VARIABLE
-from acquisition.simulation.kinematics import forward
 from acquisition.simulation.motion import joint_path
 from acquisition.simulation.robot import SimulatedRobot
 from dataset.errors import DeviceError

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from acquisition.kinematics import JOINT_LIMIT, forward, link_transforms
 from acquisition.planning import VIA, CarriedCamera, configurations, is_clear, plan_path, plan_stills
 from acquisition.simulation.arm import HOME
-from acquisition.simulation.kinematics import JOINT_LIMIT, forward, link_transforms
 from acquisition.trajectories import (
     hand_eye_views,
     hemisphere_path,

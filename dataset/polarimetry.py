@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 
 from dataset.errors import ToolkitError
 from dataset.frames import SUPERPIXEL, Mosaic
-from dataset.mosaic_kernels import colour_stokes, mono_stokes, sample_stokes
+from dataset.mosaic_kernels import calibrated_stokes, colour_stokes, mono_stokes, sample_stokes
+from dataset.polarizer_response import POLARIZER_CELL, PolarizerResponse
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
 Image = NDArray[np.float32]
-
-POLARIZER_CELL: tuple[tuple[int, int], tuple[int, int]] = ((90, 45), (135, 0))
-"""Degrees of the 2x2 polarizer cell of Sony's Polarsens sensors, as displayed."""
 
 ANGLES_DEG: tuple[int, int, int, int] = (0, 45, 90, 135)
 
@@ -132,7 +130,7 @@ def split_colours(raw: Raw) -> Image:
     return np.stack([bayer[:, 0::2, 0::2], green, bayer[:, 1::2, 1::2]], axis=-1)
 
 
-def decode(raw: Raw, layout: Mosaic, bits: int) -> Stokes:
+def decode(raw: Raw, layout: Mosaic, bits: int, response: PolarizerResponse | None = None) -> Stokes:
     """The Stokes image of a mosaic, one pixel per super-pixel.
 
     Args:
@@ -140,11 +138,14 @@ def decode(raw: Raw, layout: Mosaic, bits: int) -> Stokes:
         layout: "mono": (H/2, W/2) from 2x2 cells; "colour": (H/4, W/4), each angle the mean of its four
             Bayer pixels (red, two greens, blue).
         bits: significant bits; sets the white level.
+        response: of the very sensor, as calibrated: every 2x2 cell is demodulated by its own least squares,
+            then the cells of a colour super-pixel are averaged. Without one, the ideal cell.
 
     A pixel is valid when none of its cell's raw values is saturated and S0 reaches `DARK`.
 
     Raises:
-        ToolkitError: not a mosaic of whole super-pixels, unknown layout, or not 8 or 16 bits wide.
+        ToolkitError: not a mosaic of whole super-pixels, unknown layout, not 8 or 16 bits wide, or a
+            response of another size.
     """
     size = superpixel(layout)
     _check_mosaic(raw, size)
@@ -152,8 +153,21 @@ def decode(raw: Raw, layout: Mosaic, bits: int) -> Stokes:
     out = np.empty((3, height, width), np.float32)
     valid = np.empty((height, width), np.bool_)
     white = white_level(bits)
-    kernel = mono_stokes if layout == "mono" else colour_stokes
-    kernel(np.ascontiguousarray(raw), np.float32(1 / white), SATURATED * white, np.float32(DARK), out, valid)
+    pixels, scale = np.ascontiguousarray(raw), np.float32(1 / white)
+    if response is not None:
+        if response.shape != raw.shape:
+            raise ToolkitError(
+                f"the polarizer response is of a {response.shape[1]}x{response.shape[0]} mosaic, this one "
+                f"has {raw.shape[1]}x{raw.shape[0]}; calibrate them with the same region of interest"
+            )
+        cells = size // 2
+        calibrated_stokes(
+            pixels, response.demodulation, cells, scale, SATURATED * white, np.float32(DARK), out, valid
+        )
+    elif layout == "mono":
+        mono_stokes(pixels, scale, SATURATED * white, np.float32(DARK), out, valid)
+    else:
+        colour_stokes(pixels, scale, SATURATED * white, np.float32(DARK), out, valid)
     return Stokes(out[0], out[1], out[2], valid)
 
 

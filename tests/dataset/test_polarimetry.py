@@ -14,7 +14,6 @@ from dataset import ToolkitError
 from dataset.frames import Mosaic
 from dataset.polarimetry import (
     ANGLES_DEG,
-    POLARIZER_CELL,
     Stokes,
     decode,
     encode,
@@ -25,6 +24,7 @@ from dataset.polarimetry import (
     split_colours,
     superpixel,
 )
+from dataset.polarizer_response import POLARIZER_CELL
 
 PICTURES = Path(__file__).parents[3] / "shared" / "data"
 

@@ -14,12 +14,27 @@ FORMAT = "s2p3-session"
 MAJOR, MINOR = 1, 0
 VERSION = f"{MAJOR}.{MINOR}"
 
-Kind = Literal["sequence", "intrinsics", "hand_eye", "tool_tip", "polarizer", "synthetic"]
+Kind = Literal["sequence", "intrinsics", "hand_eye", "tool_tip", "touches", "polarizer", "synthetic"]
 KINDS: tuple[str, ...] = get_args(Kind)
 
 DROP_DTYPE = [("frame_id", "<i8"), ("reason", "S64"), ("host_time_ns", "<i8")]
 """A row of the ledger. The reason has a fixed length because a file that is read while it grows may not hold
 strings of variable length."""
+
+PAUSE_DTYPE = [
+    ("first_id", "<i8"),
+    ("last_id", "<i8"),
+    ("reason", "S64"),
+    ("host_time_ns", "<i8"),
+    ("resumed_ns", "<i8"),
+]
+"""A gap that somebody asked for: the frames that the camera took meanwhile, both ends included, and when."""
+
+SEGMENT_DTYPE = [("first_frame", "<i8"), ("first_sample", "<i8"), ("begun_utc", "S32")]
+"""An uninterrupted recording: the rows of its first frame and first robot sample, and when it began."""
+
+TABLES = {"drop": DROP_DTYPE, "pause": PAUSE_DTYPE, "segment": SEGMENT_DTYPE}
+"""Rows of the datasets that are tables, by the names they have in `Dataset.dtypes`."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +55,14 @@ class Dataset:
 
     Attributes:
         path: inside the file.
-        dtypes: the numpy kinds it may have, such as ("u1", "u2"); "drop" is `DROP_DTYPE`, "text" a string.
+        dtypes: the numpy kinds it may have, such as ("u1", "u2"); a key of `TABLES`, or "text".
         shape: sizes and the letters of the module's docstring.
         units: SI, or what the name says; "1" for pure numbers.
         description: one sentence.
         required: whether every file has it, or every instance of its parent when the path holds a `*`.
         chunk: rows per HDF5 chunk of a dataset that grows frame by frame or sample by sample; 0 otherwise.
-        compressed: whether chunks pass the Blosc2 filter (LZ4, bit shuffle).
+        compressed: whether chunks pass the Blosc2 filter (LZ4, bit shuffle): one chunk an image, with its
+            checksum in the dataset `checksums`. All others carry the attribute `crc32`.
     """
 
     path: str
@@ -58,6 +74,11 @@ class Dataset:
     chunk: int = 0
     compressed: bool = False
 
+    @property
+    def checksums(self) -> str:
+        """Path of the dataset with one CRC-32 an image, for datasets of images."""
+        return "camera/crc32" if self.path == "camera/raw" else f"{self.path}_crc32"
+
 
 ATTRIBUTES: tuple[Attribute, ...] = (
     Attribute("/", "format", str, "What this file is", (FORMAT,)),
@@ -67,8 +88,14 @@ ATTRIBUTES: tuple[Attribute, ...] = (
     Attribute("/", "created_utc", str, "When recording began, ISO 8601"),
     Attribute("/", "toolkit", str, "Name and version of the program that wrote the file"),
     Attribute("/", "rig_toml", str, "The rig's description as it was used, or empty"),
+    Attribute(
+        "/", "host_boot_id", str, "Which start of the recording computer its clock counts from", required=False
+    ),
     Attribute("/", "complete", bool, "Whether the recording ended as intended"),
     Attribute("/", "repaired", str, "When and what a repair restored", required=False),
+    Attribute(
+        "/", "origin", str, "What the file was made from, where it is no recording of its own", required=False
+    ),
     Attribute("/camera", "vendor", str, "Camera vendor"),
     Attribute("/camera", "model", str, "Camera model"),
     Attribute("/camera", "serial", str, "Serial number"),
@@ -104,14 +131,35 @@ DATASETS: tuple[Dataset, ...] = (
         "camera/crc32", ("u4",), ("N",), "1", "CRC-32 of the frame's pixel bytes, row by row", chunk=1024
     ),
     Dataset("camera/frame_id", ("i8",), ("N",), "1", "The camera's frame counter, unwrapped", chunk=1024),
-    Dataset("camera/camera_time_ns", ("i8",), ("N",), "ns", "Exposure start, camera clock", chunk=1024),
     Dataset(
-        "camera/host_time_ns", ("i8",), ("N",), "ns", "First packet seen, host monotonic clock", chunk=1024
+        "camera/camera_time_ns",
+        ("i8",),
+        ("N",),
+        "ns",
+        "Exposure start, camera clock; all -1: unknown",
+        chunk=1024,
     ),
-    Dataset("camera/exposure_us", ("f8",), ("N",), "us", "Exposure time", chunk=1024),
-    Dataset("camera/gain_db", ("f8",), ("N",), "dB", "Analogue gain", chunk=1024),
+    Dataset(
+        "camera/host_time_ns",
+        ("i8",),
+        ("N",),
+        "ns",
+        "First packet seen, host monotonic clock; all -1: unknown",
+        chunk=1024,
+    ),
+    Dataset("camera/exposure_us", ("f8",), ("N",), "us", "Exposure time; all NaN: unknown", chunk=1024),
+    Dataset("camera/gain_db", ("f8",), ("N",), "dB", "Analogue gain; all NaN: unknown", chunk=1024),
     Dataset("camera/missing_packets", ("i4",), ("N",), "1", "Packets that never arrived", chunk=1024),
     Dataset("camera/drops", ("drop",), ("D",), "1", "Frames known to exist and not stored", chunk=1024),
+    Dataset(
+        "camera/pauses",
+        ("pause",),
+        ("n",),
+        "1",
+        "Gaps that were asked for; their frames count neither as stored nor as lost",
+        required=False,
+        chunk=64,
+    ),
     Dataset(
         "robot/host_time_ns", ("i8",), ("M",), "ns", "Sample first seen, host monotonic clock", chunk=1024
     ),
@@ -129,16 +177,70 @@ DATASETS: tuple[Dataset, ...] = (
         "flange<-tcp as x y z and a rotation vector; NaN: unknown",
     ),
     Dataset(
-        "clocks/camera", ("f8",), (3,), "ns, 1, ns", "a, b, sigma of host = a + b camera; NaN: not fitted"
+        "clocks/camera", ("f8",), (3,), "ns, 1, ns", "a, b, sigma of host = a + b camera; NaN: see pieces"
     ),
-    Dataset("clocks/robot", ("f8",), (3,), "ns, 1, ns", "a, b, sigma of host = a + b robot; NaN: not fitted"),
+    Dataset("clocks/robot", ("f8",), (3,), "ns, 1, ns", "a, b, sigma of host = a + b robot; NaN: see pieces"),
     Dataset(
-        "depth", ("u2",), ("N", "h", "w"), "mm", "Depth registered to the polarization image", required=False
+        "clocks/camera_pieces",
+        ("f8",),
+        ("n", 4),
+        "1, ns, 1, ns",
+        "Row of the first frame of each piece, then its a, b, sigma of host = a + b camera",
+        required=False,
+        chunk=64,
+    ),
+    Dataset(
+        "clocks/robot_pieces",
+        ("f8",),
+        ("n", 4),
+        "1, ns, 1, ns",
+        "Row of the first sample of each piece, then its a, b, sigma of host = a + b robot",
+        required=False,
+        chunk=64,
+    ),
+    Dataset(
+        "segments",
+        ("segment",),
+        ("n",),
+        "1",
+        "Uninterrupted recordings that the file is made of; one, unless more was appended",
+        required=False,
+        chunk=64,
+    ),
+    Dataset(
+        "depth",
+        ("u2",),
+        ("N", "h", "w"),
+        "mm",
+        "Depth in the undistorted polarization image; 0: unknown",
+        required=False,
+        chunk=1,
+        compressed=True,
+    ),
+    Dataset(
+        "depth_crc32", ("u4",), ("N",), "1", "CRC-32 of the depth image's bytes, row by row", required=False
+    ),
+    Dataset(
+        "polarizer/angle",
+        ("f8",),
+        ("N",),
+        "rad",
+        "Dial of the polarizer before the lens, counter-clockwise as the image shows it; NaN: unknown",
+        required=False,
+        chunk=1024,
     ),
     Dataset("calibration/json", ("text",), (), "1", "calibration.json as it was applied", required=False),
     Dataset("calibration/K", ("f8",), (3, 3), "px", "Pinhole matrix at the mosaic's grid", required=False),
     Dataset(
         "calibration/distortion", ("f8",), ("n",), "1", "Lens distortion, OpenCV's order", required=False
+    ),
+    Dataset(
+        "calibration/polarizer_response",
+        ("f4",),
+        ("H", "W", 3),
+        "1",
+        "Analysis vector a of every pixel, which reads a . (S0, S1, S2)",
+        required=False,
     ),
     Dataset("objects/*/vertices", ("f8",), ("V", 3), "m", "Mesh vertices in the object frame"),
     Dataset("objects/*/faces", ("i4",), ("F", 3), "1", "Vertex indices, counter-clockwise seen from outside"),
@@ -172,6 +274,7 @@ DATASETS: tuple[Dataset, ...] = (
         chunk=1,
         compressed=True,
     ),
+    Dataset("poses/objects/*/mask_crc32", ("u4",), ("N",), "1", "CRC-32 of the mask's bytes, row by row"),
     Dataset("splits/*", ("i8",), ("k",), "1", "Frame indices of a split, increasing", required=False),
 )
 
@@ -197,3 +300,14 @@ CAMERA_ATTRIBUTES: tuple[Attribute, ...] = tuple(a for a in ATTRIBUTES if a.grou
 def declaration(path: str) -> Dataset:
     """The declaration of a dataset by its path, `*` included."""
     return _BY_PATH[path]
+
+
+def matching(declared: str, path: str) -> bool:
+    """Whether a path in a file is one that a declared path (with `*`) stands for."""
+    pattern, parts = declared.strip("/").split("/"), path.strip("/").split("/")
+    return len(pattern) == len(parts) and all(p in ("*", q) for p, q in zip(pattern, parts, strict=True))
+
+
+def declared_at(path: str) -> Dataset | None:
+    """The declaration of the dataset at a path in a file; None for what the schema does not know."""
+    return next((dataset for dataset in DATASETS if matching(dataset.path, path)), None)

@@ -47,9 +47,14 @@ with Session.open("sequence.h5") as session:
 - A frame that is known to exist is stored or listed in `camera/drops`, with the reason.
 - The arm's trace is stored at the controller's rate, not one sample a frame.
 - A file whose writer was killed opens, says that it is incomplete, and `s2p3 dataset repair` restores every
-  frame that had been flushed. Each frame has a checksum.
-- An older minor version always opens. A new major version comes with a converter; a toolkit older than the
-  file says so.
+  frame that had been flushed.
+- Everything carries a CRC-32, so that damage is found and never handed on. Images have one each, in a dataset
+  beside them (`camera/crc32`, `depth_crc32`, `mask_crc32`); every other dataset has that of its bytes as its
+  attribute `crc32` (-1 while it is being written), a group that of the attributes named in `crc32_of`, as a
+  JSON object with sorted names.
+- A file of this major version always opens, whatever its minor version: a later minor version only adds, and
+  what a reader does not know it leaves alone. A new major version comes with a converter
+  (`s2p3 dataset convert`); a toolkit older than the file says so.
 
 Kinds: {", ".join(f"`{kind}`" for kind in KINDS)}.
 

@@ -9,8 +9,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from dataset.compression import checksum
 from dataset.errors import SessionError
 from dataset.session.files import attribute, reading
+from dataset.session.seals import intact
 
 
 class Contents:
@@ -24,6 +26,7 @@ class Contents:
     def __init__(self, path: Path, file: h5py.File) -> None:
         self.path = path
         self._file = file
+        self._checked: set[str] = set()
 
     def close(self) -> None:
         """Closes the file."""
@@ -40,24 +43,54 @@ class Contents:
             return tuple(self._open_file().get(group, ()))
 
     def attribute(self, group: str, name: str) -> Any:
-        """An attribute as a plain Python value; None where it is absent."""
-        with reading(self.path):
-            return attribute(self._open_file()[group], name)
+        """An attribute as a plain Python value; None where it is absent.
+
+        Raises:
+            SessionError: the group's attributes do not match their checksum.
+        """
+        with reading(self.path, f"the description of {group}"):
+            node = self._open_file()[group]
+            if group not in self._checked:
+                if not intact(node):
+                    raise _damaged(self.path, f"the description of {group}")
+                self._checked.add(group)
+            return attribute(node, name)
 
     def length(self, path: str) -> int:
         """Rows of a dataset."""
         return int(self._dataset(path).shape[0])
 
     def read(self, path: str, rows: slice | int = slice(None)) -> Any:
-        """Rows of a dataset as a numpy array; all of them unless told."""
+        """Rows of a dataset as a numpy array; all of them unless told.
+
+        Raises:
+            SessionError: absent or damaged; only a dataset that is read whole is held against its checksum.
+        """
         dataset = self._dataset(path)
         with reading(self.path, f"{path}[{rows}]" if isinstance(rows, int) else path):
-            return dataset[rows]
+            data = dataset[rows]
+            whole = not isinstance(rows, int) and len(data) == len(dataset)
+            if whole and not intact(dataset, data):
+                raise _damaged(self.path, path)
+        return data
+
+    def image(self, path: str, checksums: str, index: int) -> Any:
+        """One image of a dataset of images, held against its checksum.
+
+        Raises:
+            SessionError: absent or damaged.
+        """
+        image = self.read(path, index)
+        if checksum(image) != int(self.read(checksums, index)):
+            raise _damaged(self.path, f"{path}[{index}]")
+        return image
 
     def text(self, path: str) -> str:
         """A dataset that holds one string."""
         dataset = self._dataset(path)
         with reading(self.path, path):
+            if not intact(dataset):
+                raise _damaged(self.path, path)
             return str(dataset.asstr()[()])
 
     def _dataset(self, path: str) -> h5py.Dataset:
@@ -89,5 +122,12 @@ class StoredMasks:
         return self._contents.length(self._path)
 
     def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
-        mask: NDArray[np.bool_] = self._contents.read(self._path, index) != 0
+        mask: NDArray[np.bool_] = self._contents.image(self._path, f"{self._path}_crc32", index) != 0
         return mask
+
+
+def _damaged(path: Path, part: str) -> SessionError:
+    return SessionError(
+        f"{path}: {part} is damaged (it does not match its checksum); copy the file again from its source, "
+        f"see: s2p3 dataset validate {path}"
+    )

@@ -4,50 +4,70 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from dataset.compression import compress
 from dataset.errors import SessionError
 from dataset.frames import SUPERPIXEL
 from dataset.intrinsics import Intrinsics
-from dataset.schema import declaration
+from dataset.polarizer_response import PolarizerResponse
+from dataset.schema import Dataset, declaration
 from dataset.session.files import dtype_of, make_dataset, open_for_editing
 from dataset.session.records import ObjectPoses, ObjectRecord
+from dataset.session.seals import leave_open
 from dataset.transforms import SE3
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]*")
 
 
-def write_calibration(path: str | Path, json_text: str, intrinsics: Intrinsics) -> None:
+def write_calibration(
+    path: str | Path,
+    json_text: str,
+    intrinsics: Intrinsics | None,
+    response: PolarizerResponse | None = None,
+) -> None:
     """Stores the calibration that was applied, replacing an earlier one.
 
     Args:
         path: of a complete session.
         json_text: the whole calibration.json, kept verbatim with its sha256.
-        intrinsics: at the mosaic's grid.
+        intrinsics: at the mosaic's grid; None where they are not known yet.
+        response: of the sensor's polarizers, if calibrated: from then on Stokes images are computed with it.
 
     Raises:
-        SessionError: the file cannot be edited, or the intrinsics are for another image size.
+        SessionError: the file cannot be edited, or the calibration is for another image size.
     """
     path = Path(path)
     with open_for_editing(path) as file:
         size = _mosaic_size(file)
-        if (intrinsics.height, intrinsics.width) != size:
+        if intrinsics is not None and (intrinsics.height, intrinsics.width) != size:
             raise SessionError(
                 f"{path}: the intrinsics are for {intrinsics.width}x{intrinsics.height} pixels, the mosaic "
                 f"has {size[1]}x{size[0]}; calibrate at the mosaic's resolution"
             )
+        if response is not None and response.shape != size:
+            raise SessionError(
+                f"{path}: the polarizer response is for {response.shape[1]}x{response.shape[0]} pixels, the "
+                f"mosaic has {size[1]}x{size[0]}; calibrate the polarizers at the mosaic's resolution"
+            )
         if "calibration" in file:
             del file["calibration"]
-        store_intrinsics(file, intrinsics)
+        if intrinsics is not None:
+            store_intrinsics(file, intrinsics)
+        if response is not None:
+            declared = declaration("calibration/polarizer_response")
+            make_dataset(
+                file, declared, declared.path, response.analysis, response.analysis.shape, np.float32
+            )
         declared = declaration("calibration/json")
         make_dataset(file, declared, declared.path, json_text, (), dtype_of(declared))
         file["calibration"].attrs["sha256"] = hashlib.sha256(json_text.encode()).hexdigest()
+        leave_open(file["calibration"])
 
 
 def write_object(path: str | Path, record: ObjectRecord) -> None:
@@ -154,6 +174,33 @@ def store_object(file: h5py.File, record: ObjectRecord) -> None:
             "sha256": record.sha256,
         }
     )
+    leave_open(file[f"objects/{record.name}"])
+
+
+def store_images(
+    file: h5py.File,
+    declared: Dataset,
+    images: Iterable[NDArray[np.uint8] | NDArray[np.uint16]],
+    shape: tuple[int, int, int],
+    dtype: DTypeLike,
+    name: str = "",
+) -> None:
+    """Writes a dataset of images, each compressed, and their checksums into an open file.
+
+    Args:
+        file: open for writing.
+        declared: the images' declaration; `name` stands for the `*` in its path.
+        images: N of them, each (h, w).
+        shape, dtype: (N, h, w) and their type.
+    """
+    stored = make_dataset(file, declared, declared.path.replace("*", name), None, shape, dtype)
+    checksums = np.zeros(shape[0], np.uint32)
+    for index, image in enumerate(images):
+        chunk = compress(image)
+        stored.id.write_direct_chunk((index, 0, 0), chunk.data)
+        checksums[index] = chunk.crc32
+    beside = declaration(declared.checksums)
+    make_dataset(file, beside, beside.path.replace("*", name), checksums, checksums.shape, np.uint32)
 
 
 def _store_object_poses(file: h5py.File, path: Path, name: str, poses: ObjectPoses) -> None:
@@ -168,12 +215,14 @@ def _store_object_poses(file: h5py.File, path: Path, name: str, poses: ObjectPos
     height, width = _mosaic_size(file)
     size = (height // block, width // block)
     count = len(poses.masks)
-    declared = declaration("poses/objects/*/mask")
-    stored = make_dataset(file, declared, f"poses/objects/{name}/mask", None, (count, *size), np.uint8)
-    for i in range(count):
-        mask = poses.mask(i)
-        _require(path, f"mask {i} of {name}", mask.shape, size)
-        stored.id.write_direct_chunk((i, 0, 0), compress(mask.view(np.uint8)).data)
+
+    def masks() -> Iterator[NDArray[np.uint8]]:
+        for index in range(count):
+            mask = poses.mask(index)
+            _require(path, f"mask {index} of {name}", mask.shape, size)
+            yield mask.view(np.uint8)
+
+    store_images(file, declaration("poses/objects/*/mask"), masks(), (count, *size), np.uint8, name)
 
 
 def _matrices(poses: SE3) -> NDArray[np.float64]:

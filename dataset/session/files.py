@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike
 
 from dataset.compression import filter_options
 from dataset.errors import SessionError
-from dataset.schema import DROP_DTYPE, FORMAT, MAJOR, VERSION, Dataset
+from dataset.schema import FORMAT, MAJOR, TABLES, VERSION, Dataset
+from dataset.session.seals import leave_open, seal
 from dataset.session.superblock import HealedFile
 
 LIBVER = ("v110", "v110")
@@ -116,6 +117,7 @@ def open_for_editing(path: Path) -> Iterator[h5py.File]:
         raise _explained(path, error) from error
     with file:
         yield file
+        seal(file)
 
 
 def hold(path: Path) -> int:
@@ -189,7 +191,7 @@ def attribute(node: h5py.Group, name: str) -> Any:
 def make_dataset(
     file: h5py.File, declared: Dataset, path: str, data: ArrayLike | None, shape: tuple[int, ...], dtype: Any
 ) -> h5py.Dataset:
-    """Creates a dataset as the schema declares it, with its units and description.
+    """Creates a dataset as the schema declares it, with its units and description; `seal` the file when done.
 
     Args:
         file: open for writing.
@@ -206,14 +208,16 @@ def make_dataset(
     dataset = file.create_dataset(path, shape=shape, dtype=dtype, data=data, **options)
     dataset.attrs["units"] = declared.units
     dataset.attrs["description"] = declared.description
+    if not declared.compressed:
+        leave_open(dataset)
     return dataset
 
 
 def dtype_of(declared: Dataset) -> Any:
     """The dtype h5py should use for a declared dataset with one possible type."""
     kind = declared.dtypes[0]
-    if kind == "drop":
-        return np.dtype(DROP_DTYPE)
+    if kind in TABLES:
+        return np.dtype(TABLES[kind])
     return h5py.string_dtype() if kind == "text" else np.dtype("<" + kind)
 
 

@@ -16,6 +16,7 @@ from dataset.errors import SessionError
 from dataset.frames import SUPERPIXEL, CameraInfo, ClockFit, RobotTrace
 from dataset.intrinsics import Intrinsics
 from dataset.polarimetry import Raw, Stokes, decode, remap
+from dataset.polarizer_response import PolarizerResponse
 from dataset.schema import CAMERA_ATTRIBUTES, FRAME_COLUMNS, ROBOT_COLUMNS
 from dataset.session.contents import Contents, StoredMasks
 from dataset.session.files import open_for_reading
@@ -34,6 +35,7 @@ class Session:
         path: of the file.
         contents: everything in the file by its path, for what has no property here.
         kind, session_id, rig_toml: as stored.
+        origin: what the file was made from; empty for a recording of its own.
         complete: whether the recording ended as intended.
         camera: its description.
     """
@@ -46,6 +48,7 @@ class Session:
         self.kind = str(contents.attribute("/", "kind"))
         self.session_id = str(contents.attribute("/", "session_id"))
         self.rig_toml = str(contents.attribute("/", "rig_toml"))
+        self.origin = str(contents.attribute("/", "origin") or "")
         self._count = min(contents.length(f"camera/{name}") for name in ("raw", "crc32", *FRAME_COLUMNS))
         found = {a.name: contents.attribute("camera", a.name) for a in CAMERA_ATTRIBUTES}
         missing = [name for name, value in found.items() if value is None]
@@ -109,7 +112,8 @@ class Session:
         return pixels
 
     def stokes(self, index: int, undistort: bool = True) -> Stokes:
-        """The Stokes image of a frame, one pixel per super-pixel.
+        """The Stokes image of a frame, one pixel per super-pixel, by the `polarizer_response` where there is
+        one.
 
         Args:
             index: of the frame.
@@ -119,11 +123,26 @@ class Session:
         Raises:
             SessionError: the frame is damaged, or not calibrated when `undistort` is asked for.
         """
-        decoded = decode(self.raw(index), self.camera.mosaic, self.camera.bits)
+        decoded = decode(self.raw(index), self.camera.mosaic, self.camera.bits, self.polarizer_response)
         if not undistort:
             return decoded
         maps = self._undistort_map
         return decoded if maps is None else remap(decoded, *maps)
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether there is a depth image for every frame."""
+        return self.contents.has("depth")
+
+    def depth(self, index: int) -> NDArray[np.float32]:
+        """(h, w) float32 depth of a frame in the undistorted polarization image, metres; 0 where unknown.
+
+        Raises:
+            SessionError: there is none, or it is damaged.
+            IndexError: there is no such frame.
+        """
+        image = self.contents.image("depth", "depth_crc32", range(self._count)[index])
+        return image.astype(np.float32) * np.float32(1e-3)
 
     @cached_property
     def frame_ids(self) -> NDArray[np.int64]:
@@ -198,6 +217,22 @@ class Session:
             self.contents.read("calibration/distortion"),
         )
         return Intrinsics(matrix, distortion, self.camera.height, self.camera.width)
+
+    @cached_property
+    def polarizer_response(self) -> PolarizerResponse | None:
+        """Of the camera's pixels, as calibrated; None: Stokes images take the polarizers for ideal."""
+        if not self.contents.has("calibration/polarizer_response"):
+            return None
+        return PolarizerResponse(self.contents.read("calibration/polarizer_response"))
+
+    @cached_property
+    def polarizer_angles(self) -> NDArray[np.float64] | None:
+        """(N,) radians, NaN where unknown: the dial of the polarizer before the lens, counter-clockwise as
+        the image shows it; None in a recording without one."""
+        if not self.contents.has("polarizer/angle"):
+            return None
+        angles: NDArray[np.float64] = self.contents.read("polarizer/angle", slice(self._count))
+        return angles
 
     @cached_property
     def working_intrinsics(self) -> Intrinsics:

@@ -34,6 +34,7 @@ from dataset.schema import (
 from dataset.session.edit import store_intrinsics, store_object
 from dataset.session.files import LIBVER, create, dtype_of, hold, make_dataset
 from dataset.session.records import ObjectRecord
+from dataset.session.seals import leave_open, seal
 
 
 class SessionWriter:
@@ -134,6 +135,14 @@ class SessionWriter:
             self._frames, self._last_id = index + 1, frame.frame_id
         return index
 
+    def add_polarizer_angle(self, angle: float) -> None:
+        """Appends where the polarizer before the lens stood: radians, NaN where unknown; one a frame, in a
+        session of kind "polarizer"."""
+        with self._writing("the polarizer's angle") as file:
+            stored = file["polarizer/angle"]
+            _put(stored, len(stored), [angle])
+            file.flush()
+
     def add_drop(self, frame_id: int, reason: str, host_time_ns: int) -> None:
         """Enters a frame into the ledger of those that were exposed and not stored.
 
@@ -187,6 +196,7 @@ class SessionWriter:
     def finish(self) -> None:
         """Marks the file complete and closes it; nothing may be added afterwards."""
         with self._writing("the end of the file") as file:
+            seal(file)
             file.attrs["complete"] = True
             file.flush()
         self.close()
@@ -248,6 +258,7 @@ def _lay_out(
         "camera/drops",
         *(f"camera/{name}" for name in FRAME_COLUMNS),
         *(f"robot/{name}" for name in ROBOT_COLUMNS),
+        *(["polarizer/angle"] if kind == "polarizer" else []),
     ]
     for declared in map(declaration, growing):
         row = tuple(n for n in declared.shape[1:] if isinstance(n, int))
@@ -256,6 +267,8 @@ def _lay_out(
         make_dataset(file, declaration(path), path, np.full(size, np.nan), (size,), np.float64)
     for attribute in CAMERA_ATTRIBUTES:
         file["camera"].attrs[attribute.name] = getattr(camera, attribute.name)
+    leave_open(file)
+    leave_open(file["camera"])
     file.flush()
 
 

@@ -15,6 +15,7 @@ __all__ = ["Problem", "RepairResult", "SessionInfo", "info", "repair", "validate
 _CHECKS = (
     structure.check_attributes,
     structure.check_datasets,
+    structure.check_seals,
     content.check_frame_columns,
     content.check_ledger,
     content.check_pixels,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataset.compression import checksum
 from dataset.polarimetry import white_level
@@ -19,6 +20,7 @@ _CLOCK_RATE_TOLERANCE = 1e-3
 def check_frame_columns(view: View) -> Iterator[Problem]:
     """Ids and clocks grow, exposures are real, no packet is missing."""
     columns = {name: view.read(f"camera/{name}") for name in FRAME_COLUMNS}
+    columns = {name: None if _unknown(values) else values for name, values in columns.items()}
     for name, strict in (("frame_id", True), ("camera_time_ns", True), ("host_time_ns", False)):
         values = columns[name]
         if values is None:
@@ -38,6 +40,13 @@ def check_frame_columns(view: View) -> Iterator[Problem]:
     if missing is not None and (wrong := missing != 0).any():
         hint = "such a frame belongs in the ledger; exclude it from every split"
         yield Problem("camera/missing_packets", f"packets are missing in frame {first_frames(wrong)}", hint)
+
+
+def _unknown(values: NDArray[np.generic] | None) -> bool:
+    """Whether a column of an imported session says of every frame that nothing is known."""
+    if values is None or len(values) == 0:
+        return False
+    return bool(np.isnan(values).all() if values.dtype.kind == "f" else (values == -1).all())
 
 
 def check_ledger(view: View) -> Iterator[Problem]:

@@ -26,6 +26,7 @@ from dataset.session.files import (
     open_hdf5,
     open_healed,
 )
+from dataset.session.seals import seal
 from dataset.validate.salvage import copy_content
 
 Progress = Callable[[int, int], None]
@@ -82,6 +83,7 @@ def repair(path: str | Path, on_progress: Progress = lambda done, total: None) -
             lost = () if whole else _copy(path, file, copy, keep, damaged, note)
         if whole:
             with h5py.File(path, "r+", libver=LIBVER) as file:
+                seal(file)
                 file.attrs.update({"complete": True, "repaired": note})
         else:
             os.replace(copy, path)
@@ -139,6 +141,7 @@ def _copy(
     try:
         with h5py.File(copy, "w", libver=LIBVER) as out:
             lost = copy_content(file, out, keep, damaged)
+            seal(out)
             out.attrs.update({"complete": True, "repaired": note})
         with copy.open("rb") as stream:
             os.fsync(stream.fileno())

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataset.compression import compress
-from dataset.schema import DATASETS, DROP_DTYPE, ROBOT_COLUMNS, Dataset, declaration
+from dataset.schema import DATASETS, DROP_DTYPE, ROBOT_COLUMNS, Dataset, declaration, declared_at
 from dataset.session.files import READ_ERRORS, make_dataset
+from dataset.session.seals import SEAL, intact
 
 Indices = NDArray[np.int64]
 
@@ -34,7 +35,7 @@ def copy_content(source: h5py.File, target: h5py.File, keep: Indices, damaged: I
         if isinstance(node, h5py.Group):
             target.require_group(path).attrs.update(dict(node.attrs))
             continue
-        declared = _declared(path)
+        declared = declared_at(path)
         try:
             if path == "camera/drops":
                 _copy_drops(source, target, damaged)
@@ -42,7 +43,9 @@ def copy_content(source: h5py.File, target: h5py.File, keep: Indices, damaged: I
                 _copy_images(node, target, declared, path, keep)
             elif declared is not None:
                 data = _rows(node, declared, keep, samples)
-                make_dataset(target, declared, path, data, data.shape, node.dtype)
+                copied = make_dataset(target, declared, path, data, data.shape, node.dtype)
+                if not intact(node):  # stays visible: a fresh seal would call the damage good
+                    copied.attrs.modify(SEAL, node.attrs[SEAL])
             else:
                 source.copy(node, target, name=path)
         except READ_ERRORS:
@@ -68,15 +71,6 @@ def _walk(group: h5py.Group, prefix: str, lost: list[str]) -> Iterator[tuple[str
         yield path, node
         if isinstance(node, h5py.Group):
             yield from _walk(node, path + "/", lost)
-
-
-def _declared(path: str) -> Dataset | None:
-    parts = path.split("/")
-    for declared in DATASETS:
-        pattern = declared.path.split("/")
-        if len(pattern) == len(parts) and all(p in ("*", q) for p, q in zip(pattern, parts, strict=True)):
-            return declared
-    return None
 
 
 def _rows(node: h5py.Dataset, declared: Dataset, keep: Indices, samples: int) -> NDArray[np.generic]:

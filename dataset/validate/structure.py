@@ -8,8 +8,9 @@ import h5py
 import numpy as np
 
 from dataset.frames import SUPERPIXEL
-from dataset.schema import ATTRIBUTES, DATASETS, DROP_DTYPE, Attribute, Dataset
-from dataset.session.files import attribute
+from dataset.schema import ATTRIBUTES, DATASETS, TABLES, Attribute, Dataset
+from dataset.session.files import READ_ERRORS, attribute
+from dataset.session.seals import OPEN, intact, state
 from dataset.validate.problems import Problem, View, instances
 
 _RERECORD = "the file was not written by this toolkit, or was changed since; record or import it again"
@@ -46,6 +47,31 @@ def check_datasets(view: View) -> Iterator[Problem]:
                     view.unusable.add(path)
                 yield from problems
                 yield from _check_documented(node, path, declared)
+
+
+def check_seals(view: View) -> Iterator[Problem]:
+    """Arrays and descriptions are as they were written, by their checksums."""
+    hint = "copy the file again from its source; numbers in it are wrong"
+    for declared in DATASETS:
+        for path, _ in instances(view, declared.path):
+            node = view.dataset(path)
+            if node is not None and not declared.compressed:
+                yield from _check_seal(view, node, path, hint)
+    for group in dict.fromkeys(declared.group for declared in ATTRIBUTES):
+        for path, _ in instances(view, group):
+            node = view.file.get(path)
+            if isinstance(node, h5py.Group):
+                yield from _check_seal(view, node, f"{path.rstrip('/')}/@", hint)
+
+
+def _check_seal(view: View, node: h5py.Group | h5py.Dataset, where: str, hint: str) -> Iterator[Problem]:
+    try:
+        if not intact(node):
+            yield Problem(where, "does not match its checksum", hint)
+        elif state(node) == OPEN and attribute(view.file, "complete"):
+            yield Problem(where, "was not sealed with a checksum", "an edit was cut short; repeat it")
+    except READ_ERRORS as error:
+        yield Problem(where, f"cannot be read ({error})", hint)
 
 
 def _sizes(view: View) -> dict[str, int]:
@@ -96,8 +122,8 @@ def _check_dataset(
 
 
 def _has_dtype(node: h5py.Dataset, kind: str) -> bool:
-    if kind == "drop":
-        return bool(node.dtype == np.dtype(DROP_DTYPE))
+    if kind in TABLES:
+        return bool(node.dtype == np.dtype(TABLES[kind]))
     if kind == "text":
         return h5py.check_string_dtype(node.dtype) is not None
     return node.dtype.kind == kind[0] and node.dtype.itemsize == int(kind[1])

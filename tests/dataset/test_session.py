@@ -27,6 +27,8 @@ from dataset.session import (
     write_poses,
     write_split,
 )
+from dataset.session.seals import leave_open, seal
+from dataset.validate import validate
 
 
 def test_a_session_round_trips(
@@ -357,9 +359,14 @@ def test_files_that_are_no_session_are_refused(tmp_path: Path, recorded: Path) -
 def test_a_newer_minor_version_opens(recorded: Path) -> None:
     with h5py.File(recorded, "r+") as file:
         file.attrs["schema"] = "1.7"
+        file.attrs["weather"] = "fair"
         file["camera/temperature"] = np.zeros(12)
+        file["lidar/points"] = np.zeros((12, 3))
+        leave_open(file)
+        seal(file)
     with Session.open(recorded) as session:
         assert session.raw(0).shape == (32, 48)
+    assert validate(recorded) == []
 
 
 def test_a_damaged_frame_is_never_handed_out(recorded: Path, make_frame: Callable[..., RawFrame]) -> None:

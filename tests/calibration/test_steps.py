@@ -15,6 +15,7 @@ from calibration.detection import detect
 from calibration.sessions import detect_session, views_at_rest
 from calibration.steps import add_hand_eye, add_intrinsics, report_path
 from dataset.session import Session
+from dataset.session.seals import leave_open, seal
 from dataset.transforms import translation_error_mm
 
 _SHAKEN = 2
@@ -31,6 +32,8 @@ def shaken(stills, tmp_path_factory: pytest.TempPathFactory) -> Path:
         pose = file["robot/pose"][:]
         pose[during, 0] += np.where(np.arange(during.sum()) % 2, 2e-3, -2e-3)
         file["robot/pose"][:] = pose
+        leave_open(file["robot/pose"])
+        seal(file)
     return path
 
 

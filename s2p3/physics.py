@@ -16,8 +16,11 @@ from __future__ import annotations
 
 from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from s2p3.physics_kernels import priors
 
 Numeric = TypeVar("Numeric", Tensor, float)
 """A tensor, or anything that computes like a float: also a numpy array."""
@@ -114,21 +117,44 @@ def from_ray_frame(directions: Tensor, rays: Tensor) -> Tensor:
     return torch.stack([x + a * along, y + b * along, c * z - a * x - b * y], dim=1)
 
 
-def shape_priors(stokes: Tensor, index: float, K: Tensor) -> Tensor:
+def shape_priors(stokes: Tensor, index: float, K: Tensor, out: Tensor | None = None) -> Tensor:
     """The three normal maps that explain a measured polarization: n_d, n_s1, n_s2.
 
     Args:
         stokes: (B, 3, H, W) S0, S1, S2, in any unit.
         index: refractive index of the object.
         K: (B, 3, 3) intrinsics of these pixels.
+        out: where to put the result, (B, 9, H, W) float32, contiguous, on the CPU: at a camera's rate a fresh
+            array costs more than what is computed into it.
 
     Returns:
         (B, 9, H, W) unit normals, OpenCV camera frame. Of the two azimuths that differ by 180 deg the one
         equal to the angle of polarization in (-90, 90] deg is taken for n_d, and 90 deg more for n_s1 and
-        n_s2. Finite everywhere, also without light.
+        n_s2. Finite everywhere, also without light. A measurement has no gradient: none flows to `stokes`.
 
-    The paper's equations of AoP, DoP and normal, with the azimuth without trigonometry.
+    On the CPU in float32 by one compiled pass, elsewhere by `shape_priors_reference`; the compiled one is the
+    more accurate of the two in float32, within 2e-6 of the exact normal but for one pixel in a thousand.
     """
+    stokes = stokes.detach()
+    if stokes.device.type != "cpu" or stokes.dtype != torch.float32:
+        exact = shape_priors_reference(stokes, index, K)
+        return exact if out is None else out.copy_(exact)
+    pinholes = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]], dim=1)
+    if out is None:
+        out = torch.empty(len(stokes), 9, *stokes.shape[2:])
+    priors(
+        stokes.contiguous().numpy(),
+        pinholes.detach().cpu().float().numpy(),
+        np.float32(index),
+        np.float32(_DARK),
+        out.numpy(),
+    )
+    return out
+
+
+def shape_priors_reference(stokes: Tensor, index: float, K: Tensor) -> Tensor:
+    """`shape_priors` in plain torch, for any device and precision: the paper's equations of AoP, DoP and
+    normal as they stand, with the azimuth without trigonometry."""
     s0, s1, s2 = stokes.unbind(1)
     polarized = torch.hypot(s1, s2)
     dolp = (polarized / s0.clamp_min(_DARK)).clamp(0, 1)
@@ -136,7 +162,8 @@ def shape_priors(stokes: Tensor, index: float, K: Tensor) -> Tensor:
         -1, 1
     )
     cosine = ((1 + doubled) / 2).sqrt()
-    sine = torch.copysign(((1 - doubled) / 2).sqrt(), s2)
+    sine = ((1 - doubled) / 2).sqrt()
+    sine = torch.where(s2 < 0, -sine, sine)
     rays = pixel_rays(K, stokes.shape[2], stokes.shape[3])
     diffuse, below, above = invert_dolp(dolp, index)
     normals = [

@@ -170,3 +170,45 @@ def test_priors_without_light_or_beyond_full_polarization_are_finite_unit_normal
     priors = physics.shape_priors(stokes.T.reshape(1, 3, 1, 5), 1.5, torch.eye(3)[None] + 1.0)
     assert torch.isfinite(priors).all()
     torch.testing.assert_close(priors.reshape(3, 3, 5).norm(dim=1), torch.ones(3, 5))
+
+
+def _measured(kind: str, dtype: torch.dtype) -> Tensor:
+    """(2, 3, 24, 37) Stokes: pictures that occur, and ones that should not."""
+    generator = torch.Generator().manual_seed(4)
+    s0, dolp, angle = torch.rand(3, 2, 24, 37, generator=generator, dtype=torch.float64)
+    if kind == "nearly unpolarized":
+        dolp = 10 ** (-6 * dolp)
+    elif kind == "nearly fully polarized":
+        dolp = 1 - 10 ** (-6 * dolp)
+    elif kind == "beyond full polarization":
+        dolp = 1 + dolp
+    elif kind == "on the axes":
+        angle = (4 * angle).floor() / 4
+    angle = 2 * math.pi * angle
+    return torch.stack([s0, s0 * dolp * angle.cos(), s0 * dolp * angle.sin()], dim=1).to(dtype)
+
+
+@pytest.mark.parametrize("n", INDICES)
+@pytest.mark.parametrize(
+    "kind",
+    ["any", "nearly unpolarized", "nearly fully polarized", "beyond full polarization", "on the axes"],
+)
+def test_the_compiled_priors_are_those_of_the_reference(kind: str, n: float) -> None:
+    stokes = _measured(kind, torch.float32)
+    cameras = torch.cat([K, K + torch.tensor([[0.0, 0, 7], [0, 3, -4], [0, 0, 0]])])
+    fast = physics.shape_priors(stokes, n, cameras.float())
+    exact = physics.shape_priors_reference(stokes.double(), n, cameras)
+    plain = physics.shape_priors_reference(stokes, n, cameras.float())
+    assert torch.isfinite(fast).all()
+    torch.testing.assert_close(fast.reshape(2, 3, 3, 24, 37).norm(dim=2), torch.ones(2, 3, 24, 37))
+    worst, worst_plain = (torch.quantile((maps.double() - exact).abs(), 0.999) for maps in (fast, plain))
+    assert worst <= max(2e-6, 1.5 * float(worst_plain))
+
+
+def test_compiled_priors_of_strided_and_dark_images() -> None:
+    stokes = _measured("any", torch.float32)
+    stokes[:, :, :4] = 0
+    strided = stokes.permute(0, 1, 3, 2).contiguous().permute(0, 1, 3, 2)
+    fast = physics.shape_priors(strided, 1.5, K.float().expand(2, 3, 3))
+    exact = physics.shape_priors_reference(stokes.double(), 1.5, K.expand(2, 3, 3))
+    torch.testing.assert_close(fast, exact.float(), atol=2e-6, rtol=0)

@@ -1,0 +1,23 @@
+"""Times functions against each other on a shared machine: in turns, so that what slows one slows all."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from statistics import median
+
+Contenders = dict[str, Callable[[], object]]
+
+
+def in_turns(contenders: Contenders, rounds: int = 40, warm_up: int = 3) -> dict[str, float]:
+    """Median milliseconds of each function over rounds in which every one runs once."""
+    for _ in range(warm_up):
+        for run in contenders.values():
+            run()
+    times: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(rounds):
+        for name, run in contenders.items():
+            start = time.perf_counter()
+            run()
+            times[name].append(1e3 * (time.perf_counter() - start))
+    return {name: median(taken) for name, taken in times.items()}

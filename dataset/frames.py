@@ -26,6 +26,8 @@ class CameraInfo:
         width, height: of the raw mosaic, pixels.
         bits: significant bits of a pixel value (12 for a 12-bit format held in uint16).
         packet_size: GigE Vision packet size, bytes; 0 where the transport has none.
+        clock: whose clock the frames' `camera_time_ns` is on: "camera", or "host" where the camera stamps
+            nothing and all there is to know is when a frame arrived.
     """
 
     vendor: str
@@ -38,6 +40,7 @@ class CameraInfo:
     height: int
     bits: int
     packet_size: int
+    clock: Literal["camera", "host"] = "camera"
 
     @property
     def working_size(self) -> tuple[int, int]:
@@ -51,14 +54,18 @@ class RawFrame:
     """One exposure as the camera sent it.
 
     Attributes:
-        pixels: (H, W) uint8 or uint16, the raw mosaic.
+        pixels: (H, W) uint8 or uint16, the raw mosaic; of a format that the camera computes, its channels in
+            the cells of the mosaic, see `dataset.pixel_formats`.
         pixel_format: PFNC name.
         frame_id: the camera's counter, unwrapped: it only grows, and a gap is a lost frame.
-        camera_time_ns: START of the exposure on the camera's own clock.
+        camera_time_ns: START of the exposure on the camera's own clock; `host_time_ns` where it has none, see
+            `CameraInfo.clock`.
         host_time_ns: host monotonic clock when the first packet was seen.
-        exposure_us: exposure time, microseconds.
-        gain_db: analogue gain, decibels.
+        exposure_us: exposure time, microseconds; NaN where the camera does not tell.
+        gain_db: analogue gain, decibels; NaN where the camera does not tell.
         missing_packets: packets that never arrived; 0 for a good frame.
+        clock_epoch: how often the camera's clock was found to be set or restarted since the camera was
+            opened; times of different epochs do not compare.
     """
 
     pixels: NDArray[np.uint8] | NDArray[np.uint16]
@@ -69,6 +76,7 @@ class RawFrame:
     exposure_us: float
     gain_db: float
     missing_packets: int
+    clock_epoch: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,12 @@ def test_hand_made_vectors(name: str, data: list[int], pixels: list[int]) -> Non
 @given(height=st.integers(1, 7), width=st.integers(1, 9), seed=st.integers(0, 1000))
 def test_every_format_round_trips(format_: PixelFormat, height: int, width: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
+    height, width = height * format_.cell, width * format_.cell
     pixels = rng.integers(0, 1 << format_.bits, (height, width)).astype(format_.dtype)
+    for row in range(format_.cell):
+        for column in range(format_.cell):
+            if format_.channels and (row, column) not in format_.places:
+                pixels[row::2, column::2] = 0
     data = pack(pixels, format_)
     assert data.dtype == np.uint8
     assert len(data) == format_.size(height, width)
@@ -53,10 +58,35 @@ def test_every_format_round_trips(format_: PixelFormat, height: int, width: int,
 
 @by_name
 def test_bits_on_the_wire_hold_the_pixel(format_: PixelFormat) -> None:
-    assert format_.bits_on_wire >= format_.bits
-    assert format_.packed == (format_.bits_on_wire not in (8, 16))
-    assert format_.colour == format_.name.startswith("BayerRG")
+    bits = format_.bits_on_wire // max(1, format_.channels)
+    assert bits >= format_.bits
+    assert format_.packed == (bits not in (8, 16))
+    assert format_.colour == ("BayerRG" in format_.name)
+    assert len(set(format_.places)) == format_.channels
+    assert (pixel_format(format_.raw_name).bits, pixel_format(format_.raw_name).channels) == (format_.bits, 0)
     assert pixel_format(format_.code) is format_ is pixel_format(format_.name)
+
+
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        ("PolarizedAngles_0d_45d_90d_135d_BayerRG8", 0x8220020F),
+        ("PolarizedAngles_0d_45d_90d_135d_BayerRG12p", 0x8230021F),
+        ("PolarizedStokes_S0_S1_S2_BayerRG8", 0x8218023F),
+        ("PolarizedStokes_S0_S1_S2_BayerRG12p", 0x8224024F),
+        ("PolarizedStokes_S0_S1_S2_S3_BayerRG8", 0x8220026F),
+        ("PolarizedStokes_S0_S1_S2_S3_BayerRG12p", 0x8230027F),
+        ("PolarizedAolp_BayerRG8", 0x810802DF),
+        ("PolarizedAolp_BayerRG12p", 0x810C02EF),
+        ("PolarizedDolp_BayerRG8", 0x810802BF),
+        ("PolarizedDolp_BayerRG12p", 0x810C02CF),
+        ("PolarizedDolpAolp_BayerRG8", 0x8210029F),
+        ("PolarizedDolpAolp_BayerRG12p", 0x821802AF),
+    ],
+)
+def test_codes_of_what_the_camera_computes(name: str, code: int) -> None:
+    """As the vendor's header has them."""
+    assert pixel_format(name).code == code
 
 
 def test_lsb_packing_is_one_bit_stream() -> None:

@@ -9,9 +9,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from acquisition.clocks import FEWEST_SAMPLES, fit_clock
 from acquisition.robot import PoseSource
 from dataset.errors import ToolkitError
 from dataset.frames import RobotTrace
@@ -22,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class TraceLog:
-    """Records an arm's trace from entering the `with` block to leaving it, and then the arm's clock.
+    """Records an arm's trace from entering the `with` block to leaving it.
 
     Args:
         source: connected, without a running trace; None for a recording without an arm.
@@ -33,8 +31,6 @@ class TraceLog:
         self._source = source
         self._writer = writer
         self._lock = threading.Lock()
-        self._robot_time_s: list[NDArray[np.float64]] = []
-        self._host_time_ns: list[NDArray[np.int64]] = []
 
     def __enter__(self) -> Self:
         if self._source is not None:
@@ -50,13 +46,13 @@ class TraceLog:
         if self._source is None:
             return
         if error is None:
-            self._finish(self._source)
+            self._store(self._source, self._source.stop_trace)
             return
         # The error under way is the one the user must see.
         with contextlib.suppress(ToolkitError):
             self.flush()
         with contextlib.suppress(ToolkitError):
-            self._finish(self._source)
+            self._store(self._source, self._source.stop_trace)
 
     def flush(self) -> RobotTrace:
         """Stores the samples that are new and returns them. Raises DeviceError where the arm was lost."""
@@ -66,24 +62,10 @@ class TraceLog:
         self._source.sample()  # raises where no more will come
         return trace
 
-    def store_clock(self) -> None:
-        """Stores the arm's clock as the samples so far show it. Raises ToolkitError where it jumped."""
-        with self._lock:
-            robot_s, host_ns = self._robot_time_s.copy(), self._host_time_ns.copy()
-        if sum(map(len, robot_s)) >= FEWEST_SAMPLES:
-            robot_ns = np.rint(1e9 * np.concatenate(robot_s)).astype(np.int64)
-            self._writer.set_clocks(robot=fit_clock(robot_ns, np.concatenate(host_ns)))
-
-    def _finish(self, source: PoseSource) -> None:
-        self._store(source, source.stop_trace)
-        self.store_clock()
-
     def _store(self, source: PoseSource, take: Callable[[], RobotTrace]) -> RobotTrace:
         with self._lock:  # two threads that take and store in turns would mix the order
             trace = take()
             self._writer.add_robot_trace(trace, source.tcp_offset)
-            self._robot_time_s.append(trace.robot_time_s)
-            self._host_time_ns.append(trace.host_time_ns)
         return trace
 
 

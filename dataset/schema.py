@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 FORMAT = "s2p3-session"
-MAJOR, MINOR = 1, 0
+MAJOR, MINOR = 1, 1
 VERSION = f"{MAJOR}.{MINOR}"
 
 Kind = Literal["sequence", "intrinsics", "hand_eye", "tool_tip", "touches", "polarizer", "synthetic"]
@@ -89,7 +89,11 @@ ATTRIBUTES: tuple[Attribute, ...] = (
     Attribute("/", "toolkit", str, "Name and version of the program that wrote the file"),
     Attribute("/", "rig_toml", str, "The rig's description as it was used, or empty"),
     Attribute(
-        "/", "host_boot_id", str, "Which start of the recording computer its clock counts from", required=False
+        "/",
+        "host_boot_id",
+        str,
+        "Which start of the recording computer its clock counts from",
+        required=False,
     ),
     Attribute("/", "complete", bool, "Whether the recording ended as intended"),
     Attribute("/", "repaired", str, "When and what a repair restored", required=False),
@@ -106,6 +110,9 @@ ATTRIBUTES: tuple[Attribute, ...] = (
     Attribute("/camera", "height", int, "Mosaic height, pixels"),
     Attribute("/camera", "bits", int, "Significant bits of a raw value"),
     Attribute("/camera", "packet_size", int, "GigE Vision packet size, bytes; 0 where there is none"),
+    Attribute(
+        "/camera", "clock", str, "Whose clock the camera time is on", ("camera", "host"), required=False
+    ),
     Attribute("/objects/*", "material", str, "Material name"),
     Attribute("/objects/*", "refractive_index", float, "Real part of the refractive index"),
     Attribute("/objects/*", "extinction", float, "Imaginary part of the refractive index"),

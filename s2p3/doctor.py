@@ -213,7 +213,7 @@ def _network(address: str, packet_size: int) -> Check:
 
 def _camera_stream(camera: Camera) -> Iterator[Check]:
     """Two seconds of free run: what arrives, and how well the camera's clock can be followed."""
-    from acquisition.clocks import fit_clock
+    from dataset.clocks import fit_clock
 
     frames = []
     camera.start("free")
@@ -252,7 +252,7 @@ def _arm_stream(rig: Rig) -> Check:
     """Two seconds of the arm's state, and how well its clock can be followed."""
     import numpy as np
 
-    from acquisition.clocks import fit_clock
+    from dataset.clocks import fit_clock
     from acquisition.robots.stream import RtdeStream
 
     try:

@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dataset.clocks import DeviceClock
 from dataset.compression import checksum
 from dataset.errors import SessionError
 from dataset.frames import SUPERPIXEL, CameraInfo, ClockFit, RobotTrace
 from dataset.intrinsics import Intrinsics
-from dataset.polarimetry import Raw, Stokes, decode, remap
+from dataset.on_camera import Polarization, as_mosaic, decode_frame, decode_polarization
+from dataset.polarimetry import Raw, Stokes, remap
 from dataset.polarizer_response import PolarizerResponse
-from dataset.schema import CAMERA_ATTRIBUTES, FRAME_COLUMNS, ROBOT_COLUMNS
+from dataset.schema import CAMERA_ATTRIBUTES, FRAME_COLUMNS, ROBOT_COLUMNS, TABLES, declaration
 from dataset.session.contents import Contents, StoredMasks
 from dataset.session.files import open_for_reading
 from dataset.session.records import Clocks, ObjectPoses, ObjectRecord
@@ -51,6 +53,7 @@ class Session:
         self.origin = str(contents.attribute("/", "origin") or "")
         self._count = min(contents.length(f"camera/{name}") for name in ("raw", "crc32", *FRAME_COLUMNS))
         found = {a.name: contents.attribute("camera", a.name) for a in CAMERA_ATTRIBUTES}
+        found = {a.name: found[a.name] for a in CAMERA_ATTRIBUTES if a.required or found[a.name] is not None}
         missing = [name for name, value in found.items() if value is None]
         if missing or found["mosaic"] not in SUPERPIXEL:
             raise SessionError(
@@ -122,12 +125,30 @@ class Session:
 
         Raises:
             SessionError: the frame is damaged, or not calibrated when `undistort` is asked for.
+            ToolkitError: the camera sent degrees and angles of polarization only.
         """
-        decoded = decode(self.raw(index), self.camera.mosaic, self.camera.bits, self.polarizer_response)
+        decoded = decode_frame(self.raw(index), self.camera, self.polarizer_response)
         if not undistort:
             return decoded
         maps = self._undistort_map
         return decoded if maps is None else remap(decoded, *maps)
+
+    def polarization(self, index: int) -> Polarization:
+        """Degree and angle of polarization as the camera saw them, distorted, whatever format was recorded.
+
+        Raises:
+            SessionError: the frame is damaged.
+        """
+        return decode_polarization(self.raw(index), self.camera)
+
+    def mosaic(self, index: int) -> Raw:
+        """The raw mosaic of a frame, (H, W); rebuilt where the camera sent Stokes channels.
+
+        Raises:
+            SessionError: the frame is damaged.
+            ToolkitError: the camera sent degrees and angles of polarization only.
+        """
+        return as_mosaic(self.raw(index), self.camera)
 
     @property
     def has_depth(self) -> bool:
@@ -171,6 +192,16 @@ class Session:
         return rows
 
     @cached_property
+    def pauses(self) -> NDArray[np.void]:
+        """Gaps that were asked for: rows of first_id, last_id, reason (bytes), host_time_ns, resumed_ns."""
+        return self._table("camera/pauses")
+
+    @cached_property
+    def segments(self) -> NDArray[np.void]:
+        """Uninterrupted recordings the file is made of: rows of first_frame, first_sample, begun_utc."""
+        return self._table("segments")
+
+    @cached_property
     def robot(self) -> RobotTrace | None:
         """Every robot sample of the recording; None where there was no robot."""
         count = min(self.contents.length(f"robot/{name}") for name in ROBOT_COLUMNS)
@@ -206,6 +237,24 @@ class Session:
             )
         half = np.rint(500.0 * self.exposures_us).astype(np.int64)
         return fit.to_host(self.camera_time_ns + half)
+
+    @cached_property
+    def time_sigma_s(self) -> NDArray[np.float64]:
+        """(N,) standard deviation of the time of each exposure among the arm's samples, seconds: that of the
+        camera's clock and of the arm's, where it has been fitted. A constant delay between them is not in it.
+
+        Raises:
+            SessionError: the camera's clock was not fitted.
+        """
+        at = self.mid_exposure_host_ns
+        camera, robot, trace = self.clocks.camera, self.clocks.robot, self.robot
+        assert camera is not None
+        variance = camera.sigmas_ns(len(at)) ** 2
+        if robot is not None and trace is not None:
+            sigmas = robot.sigmas_ns(len(trace))
+            nearest = np.searchsorted(trace.host_time_ns, at)
+            variance += sigmas[np.clip(nearest, 0, len(trace) - 1)] ** 2
+        return 1e-9 * np.sqrt(variance)
 
     @cached_property
     def intrinsics(self) -> Intrinsics | None:
@@ -324,9 +373,22 @@ class Session:
     def _column(self, name: str) -> Any:
         return self.contents.read(f"camera/{name}", slice(self._count))
 
-    def _clock(self, name: str) -> ClockFit | None:
-        a, b, sigma = (float(value) for value in self.contents.read(f"clocks/{name}"))
-        return None if np.isnan(a) else ClockFit(a, b, sigma)
+    def _table(self, path: str) -> NDArray[np.void]:
+        if not self.contents.has(path):
+            return np.empty(0, TABLES[declaration(path).dtypes[0]])
+        rows: NDArray[np.void] = self.contents.read(path)
+        return rows
+
+    def _clock(self, name: str) -> DeviceClock | None:
+        path = f"clocks/{name}_pieces"
+        pieces = self.contents.read(path) if self.contents.has(path) else np.empty((0, 4))
+        if len(pieces) == 0:
+            line = self.contents.read(f"clocks/{name}")
+            pieces = np.array([[0.0, *line]])[~np.isnan(line[:1])]
+        if len(pieces) == 0:
+            return None
+        fits = tuple(ClockFit(float(a), float(b), float(sigma)) for _, a, b, sigma in pieces)
+        return DeviceClock(tuple(int(row) for row in pieces[:, 0]), fits)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dataset.frames import ClockFit
+from dataset.clocks import DeviceClock
 from dataset.transforms import SE3
 
 
@@ -76,8 +76,8 @@ class ObjectPoses:
 class Clocks:
     """The devices' clocks on the host's; None where not fitted."""
 
-    camera: ClockFit | None
-    robot: ClockFit | None
+    camera: DeviceClock | None
+    robot: DeviceClock | None
 
 
 def mask_box(mask: NDArray[np.generic]) -> NDArray[np.float64]:

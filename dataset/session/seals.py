@@ -35,6 +35,12 @@ def leave_open(node: h5py.Group | h5py.Dataset) -> None:
     node.attrs[SEAL] = np.int64(OPEN)
 
 
+def reopen(node: h5py.Dataset) -> None:
+    """Marks a sealed dataset as being written again."""
+    if state(node) not in (None, OPEN):
+        node.attrs.modify(SEAL, np.int64(OPEN))
+
+
 def seal(file: h5py.File) -> None:
     """Seals what is still open in a file open for writing, growing ones included."""
     for node in _walk(file):

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dataset.clocks import DeviceClock
 from dataset.compression import Chunk, compress
 from dataset.errors import SessionError
 from dataset.frames import SUPERPIXEL, CameraInfo, ClockFit, RawFrame, RobotTrace
@@ -26,14 +27,17 @@ from dataset.schema import (
     FORMAT,
     FRAME_COLUMNS,
     KINDS,
+    PAUSE_DTYPE,
     ROBOT_COLUMNS,
     VERSION,
     Kind,
     declaration,
 )
+from dataset.session.clock_store import fit_stored, store
+from dataset.session.continuing import BEGINNING, GROWING, begin_segment, host_boot_id, open_to_continue
 from dataset.session.edit import store_intrinsics, store_object
 from dataset.session.files import LIBVER, create, dtype_of, hold, make_dataset
-from dataset.session.records import ObjectRecord
+from dataset.session.records import Clocks, ObjectRecord
 from dataset.session.seals import leave_open, seal
 
 
@@ -72,18 +76,42 @@ class SessionWriter:
                 f"a {camera.mosaic} mosaic of {camera.width}x{camera.height} pixels is not whole "
                 f"super-pixels; set the camera's width and height to multiples of {block}"
             )
-        self.path = Path(path)
+        file = create(Path(path))
+        _lay_out(file, kind, camera, rig_toml, _dtype_of(camera))
+        if intrinsics is not None:
+            store_intrinsics(file, intrinsics)
+        self._begin(Path(path), camera, file)
+
+    @classmethod
+    def append(cls, path: str | Path, kind: Kind, camera: CameraInfo) -> SessionWriter:
+        """Goes on with a session that was interrupted and has been repaired, in a segment of its own.
+
+        Frame ids go on from the last one, whatever the camera counts; both devices' clocks are fitted anew,
+        so camera and arm may have been restarted since.
+
+        Raises:
+            SessionError: the file is incomplete, of another kind or camera, from before this computer was
+                restarted, or holds what was computed from its frames.
+        """
+        writer = cls.__new__(cls)
+        writer._begin(Path(path), camera, open_to_continue(Path(path), kind, camera))
+        return writer
+
+    def _begin(self, path: Path, camera: CameraInfo, file: h5py.File) -> None:
+        self.path = path
         self.camera = camera
         self._lock = threading.RLock()
-        self._dtype = np.dtype(np.uint8 if camera.bits <= 8 else np.uint16)
-        self._frames = self._samples = self._drops = 0
-        self._last_id: int | None = None
-        self._file: h5py.File | None = create(self.path)
-        _lay_out(self._file, kind, camera, rig_toml, self._dtype)
-        if intrinsics is not None:
-            store_intrinsics(self._file, intrinsics)
-        self._file.swmr_mode = True
-        self._held = hold(self.path)
+        self._dtype = _dtype_of(camera)
+        self._file: h5py.File | None = file
+        self._frames, self._samples = len(file["camera/raw"]), len(file["robot/host_time_ns"])
+        self._drops, self._pauses = len(file["camera/drops"]), len(file["camera/pauses"])
+        self._last_id = int(file["camera/frame_id"][-1]) if self._frames else None
+        gaps = np.append(file["camera/drops"]["frame_id"], file["camera/pauses"]["last_id"])
+        self.last_known_id = None if self._last_id is None else int(max(self._last_id, *gaps, -1))
+        file.swmr_mode = True
+        self._held = hold(path)
+        file.attrs.modify("complete", False)
+        begin_segment(file, self._frames, self._samples)
 
     def __enter__(self) -> SessionWriter:
         return self
@@ -154,6 +182,14 @@ class SessionWriter:
             file.flush()
             self._drops += 1
 
+    def add_pause(self, first_id: int, last_id: int, reason: str, host_time_ns: int, resumed_ns: int) -> None:
+        """Declares a gap that somebody asked for: the frames from one id to another, and when they came."""
+        row = np.array([(first_id, last_id, reason.encode()[:64], host_time_ns, resumed_ns)], PAUSE_DTYPE)
+        with self._writing("a pause") as file:
+            _put(file["camera/pauses"], self._pauses, row)
+            file.flush()
+            self._pauses += 1
+
     def add_robot_trace(self, trace: RobotTrace, tcp_offset: ArrayLike) -> None:
         """Appends robot samples; call it once at the end, or again and again with what is new.
 
@@ -161,20 +197,34 @@ class SessionWriter:
             trace: M samples.
             tcp_offset: (6,) flange<-tcp as [x y z rx ry rz], metres and rotation vector.
         """
+        tool = np.asarray(tcp_offset, dtype=np.float64)
         with self._writing("the robot trace") as file:
-            file["robot/tcp_offset"][:] = np.asarray(tcp_offset, dtype=np.float64)
+            if self._samples == 0:
+                file["robot/tcp_offset"][:] = tool
+            elif not np.allclose(file["robot/tcp_offset"][:], tool, rtol=0.0, atol=1e-6, equal_nan=True):
+                raise SessionError(
+                    f"{self.path}: the arm's tool offset is not the one that the session began with; set it "
+                    "back at the pendant or in the rig file, or record to a new file"
+                )
             for name in ROBOT_COLUMNS:
                 _put(file[f"robot/{name}"], self._samples, getattr(trace, name))
             file.flush()
             self._samples += len(trace)
 
     def set_clocks(self, camera: ClockFit | None = None, robot: ClockFit | None = None) -> None:
-        """Stores clock fits; a later call replaces what it gives."""
-        with self._writing("the clock fits") as file:
+        """Stores clocks that are known, such as those of a synthetic session, in place of earlier ones."""
+        with self._writing("the clocks") as file:
             for name, fit in (("camera", camera), ("robot", robot)):
                 if fit is not None:
-                    file[f"clocks/{name}"][:] = [fit.a_ns, fit.b, fit.sigma_ns]
+                    store(file, name, DeviceClock((0,), (fit,)))
             file.flush()
+
+    def fit_clocks(self) -> Clocks:
+        """Fits both devices' clocks to all arrivals recorded so far, stores them and returns them."""
+        with self._writing("the clocks") as file:
+            clocks = fit_stored(file)
+            file.flush()
+        return clocks
 
     def add_object(self, record: ObjectRecord) -> None:
         """Stores an object's mesh and material.
@@ -248,28 +298,27 @@ def _lay_out(
             "created_utc": datetime.now(timezone.utc).isoformat(timespec="seconds"),
             "toolkit": f"s2p3 {metadata.version('s2p3')}",
             "rig_toml": rig_toml,
+            "host_boot_id": host_boot_id(),
             "complete": False,
         }
     )
     raw = declaration("camera/raw")
     make_dataset(file, raw, raw.path, None, (0, camera.height, camera.width), dtype)
-    growing = [
-        "camera/crc32",
-        "camera/drops",
-        *(f"camera/{name}" for name in FRAME_COLUMNS),
-        *(f"robot/{name}" for name in ROBOT_COLUMNS),
-        *(["polarizer/angle"] if kind == "polarizer" else []),
-    ]
+    growing = [*GROWING, *(["polarizer/angle"] if kind == "polarizer" else [])]
     for declared in map(declaration, growing):
         row = tuple(n for n in declared.shape[1:] if isinstance(n, int))
         make_dataset(file, declared, declared.path, None, (0, *row), dtype_of(declared))
-    for path, size in (("robot/tcp_offset", 6), ("clocks/camera", 3), ("clocks/robot", 3)):
+    for path, size in BEGINNING:
         make_dataset(file, declaration(path), path, np.full(size, np.nan), (size,), np.float64)
     for attribute in CAMERA_ATTRIBUTES:
         file["camera"].attrs[attribute.name] = getattr(camera, attribute.name)
     leave_open(file)
     leave_open(file["camera"])
     file.flush()
+
+
+def _dtype_of(camera: CameraInfo) -> np.dtype[np.unsignedinteger]:
+    return np.dtype(np.uint8 if camera.bits <= 8 else np.uint16)
 
 
 def _put(dataset: h5py.Dataset, index: int, rows: ArrayLike) -> None:

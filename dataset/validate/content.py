@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dataset.compression import checksum
 from dataset.polarimetry import white_level
 from dataset.schema import FRAME_COLUMNS
+from dataset.session.accounting import unexplained
 from dataset.session.files import READ_ERRORS, attribute
 from dataset.validate.problems import Problem, View, first_frames
 
@@ -21,12 +22,15 @@ def check_frame_columns(view: View) -> Iterator[Problem]:
     """Ids and clocks grow, exposures are real, no packet is missing."""
     columns = {name: view.read(f"camera/{name}") for name in FRAME_COLUMNS}
     columns = {name: None if _unknown(values) else values for name, values in columns.items()}
+    anew = _begins_anew(view, "camera", "first_frame")
     for name, strict in (("frame_id", True), ("camera_time_ns", True), ("host_time_ns", False)):
         values = columns[name]
         if values is None:
             continue
         steps = np.diff(values)
         wrong = np.append(False, steps <= 0 if strict else steps < 0)
+        if name == "camera_time_ns":
+            wrong[anew[anew < len(wrong)]] = False
         if wrong.any():
             hint = "the camera restarted or its counter was not unwrapped; split the recording there"
             yield Problem(f"camera/{name}", f"does not increase at frame {first_frames(wrong)}", hint)
@@ -40,6 +44,13 @@ def check_frame_columns(view: View) -> Iterator[Problem]:
     if missing is not None and (wrong := missing != 0).any():
         hint = "such a frame belongs in the ledger; exclude it from every split"
         yield Problem("camera/missing_packets", f"packets are missing in frame {first_frames(wrong)}", hint)
+
+
+def _begins_anew(view: View, device: str, first: str) -> NDArray[np.int64]:
+    """Rows at which a device's clock may go back: a piece of its clock begins there, or a segment."""
+    pieces, segments = view.read(f"clocks/{device}_pieces"), view.read("segments")
+    rows = [np.empty(0) if pieces is None else pieces[:, 0], [] if segments is None else segments[first]]
+    return np.unique(np.concatenate(rows)).astype(np.int64)
 
 
 def _unknown(values: NDArray[np.generic] | None) -> bool:
@@ -59,10 +70,8 @@ def check_ledger(view: View) -> Iterator[Problem]:
     if both.any():
         hint = "remove the entry, or the frame"
         yield Problem("camera/drops", f"frame id {dropped[both][0]} is in the ledger and stored", hint)
-    gaps = np.diff(ids) - 1
-    inside = np.searchsorted(dropped, ids)
-    silent = gaps - np.diff(inside)
-    for index in np.flatnonzero((gaps > 0) & (silent > 0)):
+    silent = unexplained(ids, dropped, view.read("camera/pauses"))
+    for index in np.flatnonzero(silent > 0):
         yield Problem(
             f"camera/frame_id[{index + 1}]",
             f"{silent[index]} frames between ids {ids[index]} and {ids[index + 1]} are neither stored nor "
@@ -101,6 +110,9 @@ def check_robot(view: View) -> Iterator[Problem]:
             continue
         steps = np.diff(values)
         wrong = np.append(False, ~(steps > 0) if strict else ~(steps >= 0))
+        if name == "robot_time_s":
+            anew = _begins_anew(view, "robot", "first_sample")
+            wrong[anew[anew < len(wrong)]] = False
         if wrong.any():
             hint = "the controller restarted or samples were repeated; split the recording there"
             yield Problem(f"robot/{name}", f"does not increase at sample {first_frames(wrong)}", hint)
@@ -119,11 +131,13 @@ def check_robot(view: View) -> Iterator[Problem]:
 def check_clocks(view: View) -> Iterator[Problem]:
     """A fitted clock runs at about one second a second."""
     for name in ("camera", "robot"):
-        fit = view.read(f"clocks/{name}")
-        if fit is None or np.isnan(fit).all():
-            continue
-        _, rate, sigma = fit
-        plausible = np.isfinite(fit).all() and abs(rate - 1) < _CLOCK_RATE_TOLERANCE and sigma >= 0
-        if not plausible:
+        line, pieces = view.read(f"clocks/{name}"), view.read(f"clocks/{name}_pieces")
+        fits = [] if pieces is None else list(pieces[:, 1:])
+        if line is not None and not np.isnan(line).all():
+            fits.append(line)
+        for fit in fits:
+            _, rate, sigma = fit
+            if np.isfinite(fit).all() and abs(rate - 1) < _CLOCK_RATE_TOLERANCE and sigma >= 0:
+                continue
             hint = "fit the clocks again over a longer recording"
             yield Problem(f"clocks/{name}", f"a, b, sigma = {fit.tolist()} describe no clock", hint)

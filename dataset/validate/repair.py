@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from dataset.compression import checksum
 from dataset.errors import SessionError
 from dataset.schema import FRAME_COLUMNS
+from dataset.session.clock_store import fit_stored
 from dataset.session.files import (
     LIBVER,
     READ_ERRORS,
@@ -80,9 +81,11 @@ def repair(path: str | Path, on_progress: Progress = lambda done, total: None) -
             whole = clean and not ids and len(file["camera/raw"]) == len(keep)
             if whole and attribute(file, "complete"):
                 return RepairResult(path, False, len(keep), (), ())
-            lost = () if whole else _copy(path, file, copy, keep, damaged, note)
+            ended = clean and bool(attribute(file, "complete"))
+            lost = () if whole else _copy(path, file, copy, keep, damaged, note, ended)
         if whole:
             with h5py.File(path, "r+", libver=LIBVER) as file:
+                fit_stored(file)
                 seal(file)
                 file.attrs.update({"complete": True, "repaired": note})
         else:
@@ -132,7 +135,9 @@ def _copy(
     keep: NDArray[np.int64],
     damaged: NDArray[np.int64],
     note: str,
+    ended: bool,
 ) -> tuple[str, ...]:
+    """Copies what can be read; where the recording had not `ended`, its clocks are fitted to all of it."""
     if shutil.disk_usage(path.parent).free < path.stat().st_size:
         raise SessionError(
             f"{path}: the repaired copy needs {path.stat().st_size / 1e9:.1f} GB of free disk space beside "
@@ -141,6 +146,8 @@ def _copy(
     try:
         with h5py.File(copy, "w", libver=LIBVER) as out:
             lost = copy_content(file, out, keep, damaged)
+            if not ended:
+                fit_stored(out)
             seal(out)
             out.attrs.update({"complete": True, "repaired": note})
         with copy.open("rb") as stream:

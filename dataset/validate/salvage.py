@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataset.compression import compress
-from dataset.schema import DATASETS, DROP_DTYPE, ROBOT_COLUMNS, Dataset, declaration, declared_at
+from dataset.schema import DATASETS, DROP_DTYPE, ROBOT_COLUMNS, TABLES, Dataset, declaration, declared_at
 from dataset.session.files import READ_ERRORS, make_dataset
 from dataset.session.seals import SEAL, intact
 
@@ -83,6 +83,14 @@ def _rows(node: h5py.Dataset, declared: Dataset, keep: Indices, samples: int) ->
     if declared.path == "splits/*":
         chosen = node[:]
         return np.searchsorted(keep, chosen[np.isin(chosen, keep)])
+    if declared.path == "segments":
+        segments = node[:]
+        segments["first_frame"] = np.searchsorted(keep, segments["first_frame"])
+        return np.asarray(segments)
+    if declared.path == "clocks/camera_pieces":
+        pieces = node[:]
+        pieces[:, 0] = np.searchsorted(keep, pieces[:, 0])
+        return np.asarray(pieces)
     return np.asarray(node[()], dtype=node.dtype)
 
 
@@ -113,7 +121,7 @@ def _restore_required(target: h5py.File) -> None:
     for declared in DATASETS:
         if not declared.required or "*" in declared.path or declared.path in target:
             continue
-        kind = np.dtype(DROP_DTYPE) if declared.dtypes[0] == "drop" else np.dtype(declared.dtypes[0])
+        kind = np.dtype(TABLES.get(declared.dtypes[0], declared.dtypes[0]))
         shape = tuple(n if isinstance(n, int) else 0 for n in declared.shape)
         fill = np.full(shape, np.nan if kind.kind == "f" else 0, dtype=kind) if 0 not in shape else None
         make_dataset(target, declared, declared.path, fill, shape, kind)

@@ -21,7 +21,7 @@ class SessionInfo:
         size_bytes: of the file.
         camera: its description.
         frames, drops: frames stored, and known to be missing.
-        duration_s: from the first to the last frame, camera clock, seconds.
+        duration_s: from the first to the last frame, host clock, seconds.
         robot_samples: of the arm's trace.
         clocks: whose clock was fitted to the host's.
         calibrated, posed: whether a calibration and camera poses are stored.
@@ -62,7 +62,7 @@ def info(path: str | Path) -> SessionInfo:
     with Session.open(path) as session:
         contents = session.contents
         frames = len(session)
-        ends = [int(contents.read("camera/camera_time_ns", i)) for i in (0, frames - 1)] if frames else [0]
+        ends = [int(contents.read("camera/host_time_ns", i)) for i in (0, frames - 1)] if frames else [0]
         fits = session.clocks
         return SessionInfo(
             path=str(path),

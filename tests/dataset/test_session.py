@@ -16,6 +16,7 @@ import pytest
 from dataset import SE3, CameraInfo, ClockFit, Intrinsics, RawFrame, RobotTrace, SessionError
 from dataset.polarimetry import decode
 from dataset.schema import DATASETS, VERSION
+from dataset.clocks import DeviceClock
 from dataset.session import (
     ObjectPoses,
     ObjectRecord,
@@ -59,8 +60,8 @@ def test_a_session_round_trips(
             np.testing.assert_array_equal(getattr(session.robot, name), getattr(whole, name))
         assert session.tcp_offset is not None
         assert session.tcp_offset.tolist() == [0, 0, 0.1, 0, 0, 0]
-        assert session.clocks.camera == ClockFit(-6e9, 1.0, 300.0)
-        assert session.clocks.robot == ClockFit(-99e9, 1.0, 400.0)
+        assert session.clocks.camera == DeviceClock((0,), (ClockFit(-6e9, 1.0, 300.0),))
+        assert session.clocks.robot == DeviceClock((0,), (ClockFit(-99e9, 1.0, 400.0),))
         np.testing.assert_array_equal(
             session.mid_exposure_host_ns, session.camera_time_ns - 6_000_000_000 + 1_000_000
         )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acquisition.clocks import fit_clock
+from dataset.clocks import fit_clock
 from dataset.errors import ToolkitError
 
 HOST_EPOCH_NS = 3_300_000_000_000_000

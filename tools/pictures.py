@@ -20,7 +20,6 @@ from dataset.polarimetry import Stokes, decode, remap, superpixel
 from s2p3 import objects, pictures
 from s2p3.lab.rig import BOARD
 from s2p3.lab.scene import LabScene
-from s2p3.lab.sensor import Sensor
 from s2p3.lab.truth import LabTruth, sample_truth
 from s2p3.pictures import Picture
 from s2p3.rendering import rasterize
@@ -89,7 +88,7 @@ def objects_picture() -> Picture:
 
 def measured(truth: LabTruth, T_base_cam: SE3) -> tuple[Stokes, Intrinsics]:
     """What the lab's camera measures from a pose: the undistorted working image, and its pinhole camera."""
-    sensor = Sensor(truth.full_well, truth.read_noise, truth.dolp_scale)
+    sensor = truth.sensor
     radiance = LabScene(truth).render(T_base_cam)
     mosaic = sensor.expose(radiance, _EXPOSURE, 8, True, np.random.default_rng(_LAB_SEED))
     camera = truth.intrinsics.at(superpixel("colour"))

@@ -18,8 +18,8 @@ from dataset.transforms import SE3
 from s2p3 import objects
 from s2p3.lab.arm_pose import ArmPose
 from s2p3.lab.lighting import captured_light, captured_surface
+from s2p3.lab.polarizer import HandHeldPolarizer, lamp_through
 from s2p3.lab.rig import BOARD
-from s2p3.lab.sensor import Sensor
 from s2p3.lab.table import Table, render_table, wood_texture
 from s2p3.lab.truth import LabTruth
 from s2p3.rendering.rasterizer import projected_region, rasterize
@@ -69,10 +69,10 @@ class LabScene:
 class LabCamera:
     """The frame source of the simulated camera: the scene, from where the arm carries the sensor."""
 
-    def __init__(self, scene: LabScene, arm: ArmPose) -> None:
+    def __init__(self, scene: LabScene, arm: ArmPose, polarizer: HandHeldPolarizer) -> None:
         truth = scene.truth
-        self._scene, self._arm = scene, arm
-        self._sensor = Sensor(truth.full_well, truth.read_noise, truth.dolp_scale)
+        self._scene, self._arm, self._polarizer = scene, arm, polarizer
+        self._sensor = truth.sensor
         self._rng = np.random.default_rng(truth.seed + 2)
 
     def frame(
@@ -81,7 +81,11 @@ class LabCamera:
         """See acquisition.simulation.patterns.FrameSource."""
         truth = self._scene.truth
         exposed_s = time_ns * 1e-9 + exposure_us * 0.5e-6 - truth.exposure_offset_s
-        stokes = self._scene.render(truth.T_base_flange(self._arm.at(exposed_s)) @ truth.T_tcp_cam)
+        angle = self._polarizer.angle()
+        if angle is None:
+            stokes = self._scene.render(truth.T_base_flange(self._arm.at(exposed_s)) @ truth.T_tcp_cam)
+        else:
+            stokes = lamp_through(angle, truth.intrinsics.height // _CELL, truth.intrinsics.width // _CELL)
         signal = exposure_us / _REFERENCE_EXPOSURE_US * 10 ** (gain_db / 20)
         layout = pixel_formats.pixel_format(pixel_format)
         mosaic = self._sensor.expose(stokes, signal, layout.bits, layout.colour, self._rng)[:height, :width]
@@ -95,4 +99,6 @@ def board_spec(board: BoardTable) -> BoardSpec:
 
 def camera_source(truth: str, arm_host: str, arm_hz: float) -> LabCamera:
     """What the simulated camera's `--source` names."""
-    return LabCamera(LabScene(LabTruth.load(Path(truth))), ArmPose(arm_host, arm_hz))
+    path = Path(truth)
+    scene, arm = LabScene(LabTruth.load(path)), ArmPose(arm_host, arm_hz)
+    return LabCamera(scene, arm, HandHeldPolarizer(path))

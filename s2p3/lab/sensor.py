@@ -8,15 +8,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from dataset.polarizer_response import PolarizerResponse, nominal_orientation
+
 Image = NDArray[np.float32]
 
 _TABLE_BITS = 21
-_COS_2A = np.array([[-1.0, 0.0], [0.0, 1.0]], np.float32)
-_SIN_2A = np.array([[0.0, 1.0], [-1.0, 0.0]], np.float32)
-"""cos 2a and sin 2a of the polarizer cell 90 45 / 135 0."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sensor:
     """A Polarsens sensor behind a colour filter array."""
 
@@ -24,8 +23,8 @@ class Sensor:
     """Electrons at the white level."""
     read_noise: float
     """Electrons, standard deviation."""
-    polarization_efficiency: float
-    """Factor on the degree of polarization: wire-grid polarizers leak."""
+    response: PolarizerResponse
+    """Gain, extinction and orientation of every pixel's polarizer."""
     colour_gains: tuple[float, float, float] = (0.92, 1.0, 0.84)
     noise: Image = field(
         default_factory=lambda: np.random.default_rng(0).standard_normal(1 << _TABLE_BITS, dtype=np.float32),
@@ -38,7 +37,8 @@ class Sensor:
         """Expose one frame.
 
         Args:
-            stokes: (3, h, w) radiance; 1 is a white, well-lit surface.
+            stokes: (3, h, w) radiance, a vector for each 2x2 cell of the sensor; 1 is a white, well-lit
+                surface.
             signal: fraction of the white level that radiance 1 reaches at this exposure and gain.
             bits: of the analogue-to-digital converter.
             colour: True for the 4x4 colour super-pixel, False for the 2x2 monochrome cell.
@@ -47,14 +47,12 @@ class Sensor:
         Returns:
             (2 h, 2 w) uint16 mosaic in [0, 2**bits - 1].
         """
-        height, width = stokes.shape[1:]
-        out = np.empty((2 * height, 2 * width), np.uint16)
+        out = np.empty(self.response.shape, np.uint16)
         gains = np.array(self.colour_gains if colour else (1.0, 1.0, 1.0), np.float32)
         _expose(
             stokes,
-            np.float32(signal),
-            np.float32(self.polarization_efficiency),
-            gains,
+            self.response.analysis,
+            np.float32(signal) * gains,
             np.float32(self.full_well),
             np.float32(self.read_noise),
             np.float32((1 << bits) - 1),
@@ -66,11 +64,30 @@ class Sensor:
         return out
 
 
+def made_sensor(
+    height: int,
+    width: int,
+    extinction_ratio: tuple[float, float],
+    orientation_sigma_rad: float,
+    gain_sigma: float,
+    rng: np.random.Generator,
+) -> PolarizerResponse:
+    """What comes out of a fab: extinction ratios spread evenly over a range, orientations and gains normally
+    about the nominal ones, pixel by pixel."""
+    shape = (height, width)
+    low, high = extinction_ratio
+    return PolarizerResponse.of(
+        1 + gain_sigma * rng.standard_normal(shape, dtype=np.float32),
+        low + (high - low) * rng.random(shape, dtype=np.float32),
+        nominal_orientation(height, width)
+        + orientation_sigma_rad * rng.standard_normal(shape, dtype=np.float32),
+    )
+
+
 @numba.njit(cache=True, fastmath=True, parallel=True)
 def _expose(  # pragma: no cover - compiled
     stokes: Image,
-    signal: float,
-    efficiency: float,
+    analysis: Image,
     gains: Image,
     full_well: float,
     read_noise: float,
@@ -87,14 +104,12 @@ def _expose(  # pragma: no cover - compiled
         # A new start on each row: consecutive frames and rows share no pattern.
         position = (start + i * stride) & mask
         for j in range(width):
-            channel = (i & 1) + (j & 1)
-            amplitude = 0.5 * signal * gains[channel]
-            s0 = stokes[0, i, j] * amplitude
-            s1 = stokes[1, i, j] * amplitude * efficiency
-            s2 = stokes[2, i, j] * amplitude * efficiency
+            gain = gains[(i & 1) + (j & 1)]
+            s0, s1, s2 = gain * stokes[0, i, j], gain * stokes[1, i, j], gain * stokes[2, i, j]
             for a in range(2):
                 for b in range(2):
-                    value = max(s0 + s1 * _COS_2A[a, b] + s2 * _SIN_2A[a, b], 0.0)
+                    vector = analysis[2 * i + a, 2 * j + b]
+                    value = max(vector[0] * s0 + vector[1] * s1 + vector[2] * s2, 0.0)
                     position = (position + 1) & mask
                     electrons = value * full_well
                     value += noise[position] * np.sqrt(electrons + read_noise * read_noise) * per_electron

@@ -16,6 +16,7 @@ import numpy as np
 from dataset.errors import ToolkitError
 from dataset.intrinsics import Intrinsics
 from dataset.transforms import SE3
+from s2p3.lab.sensor import Sensor, made_sensor
 
 MOSAIC_HEIGHT, MOSAIC_WIDTH = 2048, 2448
 
@@ -51,7 +52,11 @@ class LabTruth:
     arm_error_rad: float
     """Amplitudes of the arm's own error: its links are not quite what its controller computes with."""
     refractive_index: float
-    dolp_scale: float
+    extinction_ratio: tuple[float, ...]
+    """Range of the pixels' polarizers, T_max / T_min."""
+    orientation_sigma_rad: float
+    gain_sigma: float
+    """Of the pixels' polarizers, about the nominal."""
     read_noise: float
     full_well: float
     touch_noise_m: float
@@ -61,6 +66,20 @@ class LabTruth:
     def intrinsics(self) -> Intrinsics:
         K = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
         return Intrinsics(K, np.array(self.distortion), MOSAIC_HEIGHT, MOSAIC_WIDTH)
+
+    @property
+    def sensor(self) -> Sensor:
+        """The camera's sensor, pixel by pixel."""
+        low, high = self.extinction_ratio
+        made = made_sensor(
+            MOSAIC_HEIGHT,
+            MOSAIC_WIDTH,
+            (low, high),
+            self.orientation_sigma_rad,
+            self.gain_sigma,
+            np.random.default_rng(self.seed + 5),
+        )
+        return Sensor(self.full_well, self.read_noise, made)
 
     @property
     def T_tcp_cam(self) -> SE3:
@@ -109,6 +128,8 @@ NOMINAL_TCP_CAM = (0.0, -0.075, 0.045, 0.0, 0.0, float(np.pi))
 NOMINAL_BOARD_CENTRE = (0.45, -0.22, 0.0)
 NOMINAL_OBJECT_CENTRE = (0.45, 0.20, 0.0)
 TCP_TIP = (0.0, 0.0, 0.18)
+TIP_PLAY_M = 2e-3
+"""How far from that the tip is, an axis at most: it was screwed on by hand."""
 _ARM_ERROR_PERIOD_M = 0.4
 NOMINAL_FOCAL_PX = 1739.0
 """A 6 mm lens on 3.45 um pixels."""
@@ -154,7 +175,6 @@ def sample_truth(
         tcp_cam=_tuple(tcp_cam),
         base_board=_tuple(T_base_board),
         base_object=_tuple(T_base_object),
-        tcp_tip=TCP_TIP,
         latency_s=rng.uniform(0.0, 0.03),
         exposure_offset_s=rng.uniform(0.020, 0.040),
         camera_drift_ppm=rng.uniform(-60, 60),
@@ -162,10 +182,13 @@ def sample_truth(
         arm_error_m=5e-5,
         arm_error_rad=1e-4,
         refractive_index=nominal_index * rng.uniform(1.03, 1.08),
-        dolp_scale=rng.uniform(0.93, 0.97),
+        extinction_ratio=(50.0, 300.0),
+        orientation_sigma_rad=float(np.radians(1.0)),
+        gain_sigma=0.02,
         read_noise=2.5,
         full_well=10_000.0,
         touch_noise_m=1e-4,
+        tcp_tip=tuple(float(c) for c in np.array(TCP_TIP) + rng.uniform(-TIP_PLAY_M, TIP_PLAY_M, 3)),
     )
 
 

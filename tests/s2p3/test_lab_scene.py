@@ -8,6 +8,7 @@ import torch
 
 from calibration.detection import detect_in_mosaic
 from dataset.polarimetry import decode
+from dataset.polarizer_response import PolarizerResponse, nominal_orientation
 from dataset.transforms import SE3
 from s2p3 import objects, physics
 from s2p3.lab.rig import BOARD
@@ -30,7 +31,7 @@ def scene(truth: LabTruth) -> LabScene:
 
 @pytest.fixture(scope="module")
 def sensor(truth: LabTruth) -> Sensor:
-    return Sensor(truth.full_well, truth.read_noise, truth.dolp_scale)
+    return truth.sensor
 
 
 def looking_at(target: np.ndarray, eye: np.ndarray) -> SE3:
@@ -69,16 +70,16 @@ def test_polished_steel_polarizes_as_fresnel_says_at_the_labs_own_index(sensor: 
     _, nominal, _ = fresnel(normals, rays, model.refractive_index)
 
     raw = sensor.expose(LabScene(truth).render(view), 0.5, 12, False, np.random.default_rng(1))
-    stokes = decode(raw, "mono", 12)
+    stokes = decode(raw, "mono", 12, sensor.response)
     s0, s1, s2 = stokes.stack()[:, window[0], window[1]]
     seen = mask & stokes.valid[window] & (mirror > 0.1) & (mirror < 0.9)
     assert seen.sum() > 3000
     across = -(s1 * phase[0] + s2 * phase[1])[seen] / s0[seen]  # light off a mirror is turned by 90 degrees
     diagonal = (s2 * phase[0] - s1 * phase[1])[seen] / s0[seen]
-    assert np.median(across / mirror[seen]) == pytest.approx(sensor.polarization_efficiency, rel=5e-3)
+    assert np.median(across / mirror[seen]) == pytest.approx(1.0, rel=5e-3)
     assert np.median(diagonal) == pytest.approx(0.0, abs=2e-3)
     # So precise that the index of the model file, a few percent off, would show.
-    assert np.median(across / nominal[seen]) != pytest.approx(sensor.polarization_efficiency, rel=1e-2)
+    assert np.median(across / nominal[seen]) != pytest.approx(1.0, rel=1e-2)
 
 
 def test_plastic_stays_between_body_and_mirror(truth: LabTruth, scene: LabScene) -> None:
@@ -124,7 +125,8 @@ def test_the_table_polarizes_across_the_plane_of_incidence(truth: LabTruth, scen
 
 
 def test_sensor_has_the_mean_and_the_variance_of_its_model() -> None:
-    sensor = Sensor(full_well=8000.0, read_noise=6.0, polarization_efficiency=0.9)
+    leaking = PolarizerResponse.of(1.0, 19.0, nominal_orientation(512, 640))  # efficiency 18/20
+    sensor = Sensor(full_well=8000.0, read_noise=6.0, response=leaking)
     s0, s1, s2 = 0.8, 0.2, -0.1
     stokes = np.empty((3, 256, 320), np.float32)
     stokes[:] = np.array([s0, s1, s2])[:, None, None]
@@ -139,7 +141,7 @@ def test_sensor_has_the_mean_and_the_variance_of_its_model() -> None:
 
 
 def test_sensor_clips_at_black_and_white_and_filters_colours() -> None:
-    sensor = Sensor(full_well=1e9, read_noise=0.0, polarization_efficiency=1.0, colour_gains=(0.5, 1.0, 0.25))
+    sensor = Sensor(1e9, 0.0, PolarizerResponse.ideal(8, 8), colour_gains=(0.5, 1.0, 0.25))
     stokes = np.zeros((3, 4, 4), np.float32)
     rng = np.random.default_rng(0)
     assert sensor.expose(stokes, 1.0, 8, True, rng).max() == 0
@@ -151,7 +153,7 @@ def test_sensor_clips_at_black_and_white_and_filters_colours() -> None:
 
 
 def test_noise_differs_from_frame_to_frame_and_row_to_row() -> None:
-    sensor = Sensor(full_well=8000.0, read_noise=2.0, polarization_efficiency=1.0)
+    sensor = Sensor(full_well=8000.0, read_noise=2.0, response=PolarizerResponse.ideal(256, 256))
     stokes = np.zeros((3, 128, 128), np.float32)
     stokes[0] = 1.0
     rng = np.random.default_rng(7)

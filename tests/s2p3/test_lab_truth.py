@@ -28,7 +28,7 @@ def draw(seed: int, name: str = "cup") -> LabTruth:
 def test_the_same_seed_gives_the_same_truth_and_another_gives_another() -> None:
     assert draw(3) == draw(3)
     first, second = draw(3), draw(4)
-    for field in ("fx", "tcp_cam", "base_object", "exposure_offset_s", "refractive_index", "dolp_scale"):
+    for field in ("fx", "tcp_cam", "base_object", "exposure_offset_s", "refractive_index", "tcp_tip"):
         assert getattr(first, field) != getattr(second, field)
 
 

@@ -144,7 +144,7 @@ def _ur(config: RobotConfig) -> Robot:
 
 
 def _ur_poses(config: RobotConfig) -> PoseSource:
-    from acquisition.robots.ur import UrReceiver
+    from acquisition.robots.ur_receiver import UrReceiver
 
     return UrReceiver(config)
 

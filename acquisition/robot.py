@@ -43,7 +43,9 @@ class RobotConfig:
     Attributes:
         host: address of the controller.
         frequency_hz: rate of the trace; 500 for an e-Series arm, 125 for a CB3.
-        speed: of the tool in linear moves, m/s.
+        silence_s: how long the arm's state may fail to come before a motion or a recording is given up; a
+            simulated arm on a busy host needs more than a real one.
+        speed: of the tool, in every kind of move, m/s.
         acceleration: of the tool in linear moves, m/s^2.
         joint_speed: of the fastest joint in joint moves, rad/s.
         joint_acceleration: of the fastest joint in joint moves, rad/s^2.
@@ -59,6 +61,7 @@ class RobotConfig:
 
     host: str
     frequency_hz: float = 500.0
+    silence_s: float = 0.1
     speed: float = 0.25
     acceleration: float = 0.5
     joint_speed: float = 0.5
@@ -70,7 +73,7 @@ class RobotConfig:
     )
 
     def __post_init__(self) -> None:
-        limits = {"frequency_hz": 500, "speed": 3, "acceleration": 150, "joint_speed": np.pi}
+        limits = {"frequency_hz": 500, "silence_s": 10, "speed": 3, "acceleration": 150, "joint_speed": np.pi}
         for name, largest in {**limits, "joint_acceleration": 40}.items():
             value = getattr(self, name)
             if not 0 < value <= largest:
@@ -93,13 +96,22 @@ class PoseSource(ABC):
     def tcp_offset(self) -> Floats:
         """(6,) the active tool centre point in the flange frame, [x y z rx ry rz], metres and radians."""
 
+    @property
+    @abstractmethod
+    def payload(self) -> Floats:
+        """(4,) what the arm believes to carry: mass, kg, and its centre of gravity in the flange
+        frame, metres; NaN where the arm does not tell."""
+
     @abstractmethod
     def sample(self) -> RobotSample:
         """The newest state. Raises DeviceError rather than return one that is no longer current."""
 
     @abstractmethod
     def start_trace(self) -> None:
-        """Begins to keep every sample. Raises DeviceError where a trace is already running."""
+        """Begins to keep every sample. Raises DeviceError where a trace is already running.
+
+        A tool that is changed from here on makes the other methods raise; samples of it are not kept.
+        """
 
     @abstractmethod
     def take_trace(self) -> RobotTrace:

@@ -39,6 +39,11 @@ class MotionClient:
         self._process: ChildProcess | None = None
         self._waiter = ThreadPoolExecutor(1, thread_name_prefix="motion")
 
+    def start(self) -> None:
+        """Starts the process where there is none. Raises DeviceError where the arm takes no commands."""
+        self._check_or_abort()
+        self._ensure_started()
+
     def ask(self, verb: str, **arguments: Any) -> Any:
         """The answer to a request of `motion_service`; starts the process where there is none.
 
@@ -47,7 +52,7 @@ class MotionClient:
                 answered in time. The program on the controller is then stopped and the process killed.
         """
         line = json.dumps({"do": verb, **arguments})
-        self._check()
+        self._check_or_abort()
         process = self._ensure_started()
         try:
             answer = self._watched(self._waiter.submit(process.command, line, _ANSWER_TIMEOUT_S))
@@ -74,11 +79,24 @@ class MotionClient:
             process.stop(timeout_s=2.0)
         self._waiter.shutdown()
 
+    def _check_or_abort(self) -> None:
+        """An arm that stopped must not take its motion up again when somebody presses play."""
+        try:
+            self._check()
+        except DeviceError:
+            if self._process is not None:
+                self.abort()
+            raise
+
     def _ensure_started(self) -> ChildProcess:
         if self._process is not None and self._process.running:
             return self._process
-        for port in (SCRIPT_PORT, DASHBOARD_PORT):
-            _probe(self._host, port)
+        _probe(self._host, SCRIPT_PORT)
+        if dashboard_request(self._host, "is in remote control") == "false":
+            raise DeviceError(
+                f"the arm {self._host} is in local mode and takes no commands; switch it to remote "
+                "control at the top right of the pendant"
+            )
         process = ChildProcess(
             "acquisition.robots.motion_service", [self._host], ready_timeout_s=_START_TIMEOUT_S
         )
@@ -92,7 +110,11 @@ class MotionClient:
                 "pendant, power it on, release the brakes, and close other programs that control it"
             ) from error
         self._process = process
-        self._on_start(self)
+        try:
+            self._on_start(self)
+        except BaseException:
+            self.abort()
+            raise
         return process
 
     def _watched(self, future: Future[Any]) -> Any:
@@ -113,10 +135,13 @@ def dashboard_request(host: str, request: str) -> str:
             socket.create_connection((host, DASHBOARD_PORT), _CONNECT_TIMEOUT_S) as connection,
             connection.makefile("rw", encoding="utf-8", newline="\n") as lines,
         ):
-            lines.readline()  # the greeting
+            greeting = lines.readline()
             lines.write(f"{request}\n")
             lines.flush()
-            return lines.readline().strip()
+            answer = lines.readline()
+            if not (greeting and answer):
+                raise ConnectionError("it closed the connection")
+            return answer.strip()
     except OSError as error:
         raise DeviceError(
             f"the dashboard of the arm {host} does not answer ({error}); enable it under Settings > Security "
@@ -125,6 +150,7 @@ def dashboard_request(host: str, request: str) -> str:
 
 
 def _probe(host: str, port: int) -> None:
+    # Before the vendor's client, which would wait for a dead host without an end.
     try:
         socket.create_connection((host, port), _CONNECT_TIMEOUT_S).close()
     except OSError as error:

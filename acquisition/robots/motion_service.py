@@ -79,6 +79,9 @@ class MotionService:
         return self._started(self._control.moveJ(path, True))
 
     def moving(self) -> bool:
+        # A program that was ended at the pendant leaves its last word in the register.
+        if not self._control.isProgramRunning():
+            return False
         return bool(self._control.getAsyncOperationProgressEx().isAsyncOperationRunning())
 
     def stop(self, deceleration: float) -> bool:

@@ -24,6 +24,8 @@ PORT = 30004
 PROTOCOL_VERSION = 2
 HEADER = struct.Struct(">HB")
 
+_POLL_S = 0.02
+
 # The variables' types: (struct code, numpy code).
 TYPES = {
     "DOUBLE": ("d", ">f8"),
@@ -85,15 +87,27 @@ class RtdeReader:
         variables: names of RTDE output variables.
         frequency_hz: rate of the packages, at most the controller's own.
         timeout_s: for connecting and for every answer.
+        optional: more variables, each left out where the controller's software does not know it.
+
+    Attributes:
+        dtype: one record of what was granted.
+        silent_s: for how long nothing has come, as found by looking, not by the clock: a reader that the
+            host did not let run has not been left in silence.
 
     Raises:
         DeviceError: nothing answers there, the protocol is refused, or a variable is unknown to it.
     """
 
     def __init__(
-        self, host: str, variables: Sequence[str], frequency_hz: float, timeout_s: float = 2.0
+        self,
+        host: str,
+        variables: Sequence[str],
+        frequency_hz: float,
+        timeout_s: float = 2.0,
+        optional: Sequence[str] = (),
     ) -> None:
         self.host = host
+        self.silent_s = 0.0
         self._timeout_s = timeout_s
         self._buffer = bytearray()
         self._data: list[bytes] = []
@@ -106,7 +120,8 @@ class RtdeReader:
             ) from error
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._negotiate(variables, frequency_hz)
+            self._socket.settimeout(min(_POLL_S, timeout_s))
+            self._negotiate(variables, optional, frequency_hz)
         except BaseException:
             self.close()
             raise
@@ -123,9 +138,9 @@ class RtdeReader:
         self.close()
 
     def packages(self) -> list[bytes]:
-        """Waits for data and returns the values of every package that is complete, oldest first.
+        """Waits a moment for data and returns the values of every package that is complete, oldest first.
 
-        Each is one record of `dtype`. The list is empty where only a part of a package came.
+        Each is one record of `dtype`. The list is empty where nothing, or only a part of a package, came.
 
         Raises:
             DeviceError: silence for longer than the time-out, or the connection is gone.
@@ -144,7 +159,7 @@ class RtdeReader:
         finally:
             self._socket.close()
 
-    def _negotiate(self, variables: Sequence[str], frequency_hz: float) -> None:
+    def _negotiate(self, variables: Sequence[str], optional: Sequence[str], frequency_hz: float) -> None:
         accepted = self._ask(MessageType.PROTOCOL_VERSION, struct.pack(">H", PROTOCOL_VERSION))
         if accepted != b"\x01":
             raise DeviceError(
@@ -153,21 +168,29 @@ class RtdeReader:
             )
         version = struct.unpack(">IIII", self._ask(MessageType.CONTROLLER_VERSION))
         self.controller_version: tuple[int, int, int, int] = version
-        recipe = struct.pack(">d", frequency_hz) + ",".join(variables).encode()
-        types = self._ask(MessageType.OUTPUT_RECIPE, recipe)[1:].decode().split(",")
-        unknown = [name for name, kind in zip(variables, types, strict=False) if kind not in TYPES]
-        if unknown or len(types) != len(variables):
+        wished = [*variables, *optional]
+        types = self._subscribe(wished, frequency_hz)
+        granted = [name for name in wished if types.get(name) in TYPES]
+        unknown = [name for name in variables if name not in granted]
+        if unknown:
             raise DeviceError(
                 f"the controller at {self.host} (software {'.'.join(map(str, version))}) does not offer "
-                f"{', '.join(unknown) or 'the recipe'} over RTDE; update its software"
+                f"{', '.join(unknown)} over RTDE; update its software"
             )
-        fields = [(name, TYPES[kind][1]) for name, kind in zip(variables, types, strict=True)]
-        self.dtype = np.dtype([("recipe", "u1"), *fields])
+        if len(granted) < len(wished):
+            types = self._subscribe(granted, frequency_hz)
+        self.dtype = np.dtype([("recipe", "u1"), *((name, TYPES[types[name]][1]) for name in granted)])
         if self._ask(MessageType.START) != b"\x01":
             raise DeviceError(
                 f"the controller at {self.host} does not start its RTDE stream; another client may hold it: "
                 "close other programs that use RTDE, or restart the controller"
             )
+
+    def _subscribe(self, variables: Sequence[str], frequency_hz: float) -> dict[str, str]:
+        """Asks for a recipe; the type that the controller names for each variable."""
+        recipe = struct.pack(">d", frequency_hz) + ",".join(variables).encode()
+        types = self._ask(MessageType.OUTPUT_RECIPE, recipe)[1:].decode().split(",")
+        return dict(zip(variables, types, strict=False))
 
     def _ask(self, kind: MessageType, payload: bytes = b"") -> bytes:
         try:
@@ -184,11 +207,15 @@ class RtdeReader:
         try:
             chunk = self._socket.recv(65536)
         except TimeoutError:
-            raise self._lost(f"silent for {self._timeout_s:g} s") from None
+            self.silent_s += _POLL_S
+            if self.silent_s > self._timeout_s:
+                raise self._lost(f"silent for {self._timeout_s:g} s") from None
+            return None
         except OSError as error:
             raise self._lost(str(error)) from error
         if not chunk:
             raise self._lost("it closed the connection")
+        self.silent_s = 0.0
         self._buffer += chunk
         answer = None
         for kind, payload in take_messages(self._buffer):

@@ -43,6 +43,8 @@ class Arm:
         self.qd = np.zeros(6)
         self.motion: Motion | None = None
         self.safety_bits, self.safety_mode, self.robot_mode = NORMAL_BITS, NORMAL_MODE, RUNNING
+        self.payload = np.zeros(4)  # mass, kg, and its centre in the flange frame, metres
+        self.slider = 1.0  # the share of the commanded speed that the pendant allows
         self.last_stop = ""  # why the arm last stopped itself
         self._tool_velocity = np.zeros(3)
         self.set_tcp(np.zeros(6))
@@ -72,12 +74,15 @@ class Arm:
             self.qd = np.zeros(6)
 
     def advance(self, dt: float) -> None:
-        """One controller period. A joint at its limit, or a link at the table, is a protective stop."""
+        """One controller period. A joint at its limit, or a link at the table, is a protective stop.
+
+        The speed slider stretches a motion's time; its joint rates `qd` stay those of full speed.
+        """
         if self.motion is None:
             self.qd = np.zeros(6)
             return
         before, position = self.q, self.T_base_tcp[:3, 3]
-        self.q, self.qd, ended = self.motion.advance(self.q, self.qd, dt)
+        self.q, self.qd, ended = self.motion.advance(self.q, self.qd, dt * self.slider)
         self._update()
         self._tool_velocity = (self.T_base_tcp[:3, 3] - position) / dt
         reason = self._violation()
@@ -103,11 +108,15 @@ class Arm:
         """Ends a stop: the operator has made the arm ready again."""
         self.safety_bits, self.safety_mode, self.robot_mode = NORMAL_BITS, NORMAL_MODE, RUNNING
 
+    def joint_speed(self) -> Floats:
+        """(6,) rad/s."""
+        return self.slider * self.qd
+
     def tcp_speed(self) -> Floats:
         """(6,) linear and angular velocity of the tool centre point in the base frame, m/s and rad/s."""
         if self.motion is None:
             return np.zeros(6)
-        return np.concatenate([self._tool_velocity, self.qd @ self._links[:6, :3, 2]])
+        return np.concatenate([self._tool_velocity, self.joint_speed() @ self._links[:6, :3, 2]])
 
     def _update(self) -> None:
         self._links = link_transforms(self.q)

@@ -8,16 +8,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from acquisition.simulation.arm import REGISTERS, RUNNING, Arm, Registers
+from acquisition.simulation.motion import joint_move
 from acquisition.simulation.rtde_server import Value
 from acquisition.simulation.script import ControlScript, ProgramEnded
 
 EPOCH_S = 1000.0  # the controller's clock at its start; on purpose unrelated to any other clock
-SOFTWARE_VERSION = (5, 12, 4, 1101661)
+SOFTWARE = (5, 12, 4)
+_BUILD = 1101661
+_TOOL_SINCE = (5, 5, 1)  # the software that tells tool and payload over RTDE
 TRUE_TIME_REGISTER = 46
 TRUE_TIME_VARIABLE = f"output_double_register_{TRUE_TIME_REGISTER}"
 """Host monotonic time, in seconds, of the state in the package: what no real arm can tell, for tests and the
 simulated scene. ur_rtde's program writes this register only in functions that are not simulated."""
 
+_HAND_SPEED, _HAND_ACCELERATION = 0.5, 2.0  # rad/s, rad/s^2
 _STARTUP_S = 0.05  # between the upload of a program and its first line
 _STOPPED, _PLAYING, _PAUSED = 1, 2, 4
 
@@ -25,7 +29,7 @@ _VECTORS = (
     "target_q", "target_qd", "target_qdd", "target_current", "target_moment", "actual_q", "actual_qd",
     "actual_qdd", "actual_current", "actual_current_as_torque", "actual_moment", "joint_control_output",
     "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force", "target_TCP_pose", "target_TCP_speed",
-    "joint_temperatures", "actual_joint_voltage", "ft_raw_wrench", "payload_inertia",
+    "joint_temperatures", "actual_joint_voltage", "ft_raw_wrench", "payload_inertia", "tcp_offset",
 )  # fmt: skip
 _SPATIAL = ("actual_tool_accelerometer", "payload_cog", "elbow_position", "elbow_velocity")
 _DOUBLES = (
@@ -69,6 +73,7 @@ INPUTS: dict[str, str] = {
     **{f"input_int_register_{i}": "INT32" for i in range(REGISTERS)},
     **{f"input_double_register_{i}": "DOUBLE" for i in range(REGISTERS)},
 }
+_TOOL_OUTPUTS = ("tcp_offset", "payload", "payload_cog", "payload_inertia")
 _LENGTHS = {"VECTOR6D": 6, "VECTOR3D": 3, "VECTOR6INT32": 6}
 
 
@@ -79,9 +84,18 @@ class Controller:
         rate_hz: of its control loop.
         drift_ppm: how much faster than the host's clock its own clock runs.
         q: (6,) joint angles at the start, radians.
+        software: version of PolyScope that it passes for.
     """
 
-    def __init__(self, rate_hz: float, drift_ppm: float, q: Sequence[float]) -> None:
+    def __init__(
+        self,
+        rate_hz: float,
+        drift_ppm: float,
+        q: Sequence[float],
+        software: tuple[int, int, int] = SOFTWARE,
+    ) -> None:
+        self.software = (*software, _BUILD)
+        self.local_mode = False  # as chosen at the pendant: the arm takes no programs
         self.lock = threading.RLock()
         self.period_s = 1.0 / rate_hz
         self.arm = Arm(np.array(q))
@@ -90,19 +104,23 @@ class Controller:
             name: 0 if kind not in _LENGTHS else [0] * _LENGTHS[kind] for name, kind in OUTPUTS.items()
         }
         self.values.update(
-            speed_scaling=1.0,
-            target_speed_fraction=1.0,
             actual_main_voltage=48.0,
             actual_robot_voltage=48.0,
             joint_temperatures=[28.0] * 6,
             actual_joint_voltage=[48.0] * 6,
             joint_mode=[253] * 6,
         )
-        self._clock_rate = 1.0 + 1e-6 * drift_ppm
+        self.drift(drift_ppm)
         self._clock_s = EPOCH_S
         self._runtime = _STOPPED
         self._script: ControlScript | None = None
         self._startup_s = 0.0
+
+    @property
+    def outputs(self) -> dict[str, str]:
+        """Type name of every variable that this software offers over RTDE."""
+        unknown = () if self.software >= _TOOL_SINCE else _TOOL_OUTPUTS
+        return {name: kind for name, kind in OUTPUTS.items() if name not in unknown}
 
     @property
     def program_running(self) -> bool:
@@ -127,6 +145,30 @@ class Controller:
         with self.lock:
             self._clock_s += seconds
 
+    def drift(self, ppm: float) -> None:
+        """Lets the controller's clock run that much faster than the host's from now on."""
+        self._clock_rate = 1.0 + 1e-6 * ppm
+
+    def restart(self) -> None:
+        """As by the power switch: the clock begins anew; program, registers and tool are gone."""
+        with self.lock:
+            self.stop_program()
+            self.arm = Arm(self.arm.q)
+            self.registers = Registers()
+            self._clock_s = EPOCH_S
+
+    def switch_to(self, local: bool) -> None:
+        """As at the pendant: in local mode the arm takes no programs."""
+        with self.lock:
+            self.stop_program()
+            self.local_mode = local
+
+    def guide(self, q: Sequence[float]) -> None:
+        """A hand leads the arm to joint angles (6,), radians, whatever mode it is in."""
+        with self.lock:
+            self.stop_program()
+            self.arm.begin(joint_move(self.arm.q, np.array(q), _HAND_SPEED, _HAND_ACCELERATION))
+
     def write_input(self, name: str, value: Value) -> None:
         """An input variable that a client wrote."""
         with self.lock:
@@ -139,7 +181,7 @@ class Controller:
         """Starts a program that came in through the script port, in place of the one that runs."""
         with self.lock:
             self.stop_program()
-            if not self.arm.stopped_by_safety and self.arm.robot_mode == RUNNING:
+            if not self.local_mode and not self.arm.stopped_by_safety and self.arm.robot_mode == RUNNING:
                 self._script = ControlScript(self.arm, self.registers, text, self.period_s)
                 self._startup_s = _STARTUP_S
 
@@ -188,7 +230,7 @@ class Controller:
 
     def _publish(self, true_time_s: float) -> None:
         arm, values = self.arm, self.values
-        q, qd, pose = arm.q.tolist(), arm.qd.tolist(), arm.tcp_pose.tolist()
+        q, qd, pose = arm.q.tolist(), arm.joint_speed().tolist(), arm.tcp_pose.tolist()
         speed = arm.tcp_speed().tolist()
         values.update(
             timestamp=self._clock_s,
@@ -200,6 +242,11 @@ class Controller:
             target_TCP_pose=pose,
             actual_TCP_speed=speed,
             target_TCP_speed=speed,
+            tcp_offset=arm.tcp_offset.tolist(),
+            payload=float(arm.payload[0]),
+            payload_cog=arm.payload[1:].tolist(),
+            speed_scaling=arm.slider,
+            target_speed_fraction=arm.slider,
             robot_mode=arm.robot_mode,
             safety_mode=arm.safety_mode,
             safety_status=arm.safety_mode,

@@ -13,8 +13,9 @@ from acquisition.simulation.arm import (
     PROTECTIVE_MODE,
     RUNNING,
 )
-from acquisition.simulation.controller import SOFTWARE_VERSION, Controller
+from acquisition.simulation.controller import Controller
 
+_REMOTE_ONLY = {"stop", "restart safety", "power on", "power off", "brake release"}
 _GREETING = "Connected: Universal Robots Dashboard Server"
 _SERIAL = "20235500001"
 _ROBOT_MODES = {POWER_OFF: "POWER_OFF", IDLE: "IDLE", RUNNING: "RUNNING"}
@@ -39,6 +40,8 @@ def answer(controller: Controller, request: str) -> str:
     """The dashboard's reply to one request, which it also carries out."""
     command = _COMMANDS.get(request.lower())
     if command is not None:
+        if controller.local_mode and request.lower() in _REMOTE_ONLY:
+            return "Command is not allowed in local mode"
         with controller.lock:
             return command(controller)
     if request.lower().startswith(("popup", "addtolog")):
@@ -102,6 +105,10 @@ def _brake_release(controller: Controller) -> str:
     return "Brake releasing"
 
 
+def _version(controller: Controller) -> str:
+    return f"URSoftware {'.'.join(map(str, controller.software))} (Jan 01 2024)"
+
+
 _COMMANDS: dict[str, Callable[[Controller], str]] = {
     "stop": _stop,
     "running": _running,
@@ -114,10 +121,10 @@ _COMMANDS: dict[str, Callable[[Controller], str]] = {
     "power on": _power_on,
     "power off": _power_off,
     "brake release": _brake_release,
-    "polyscopeversion": lambda _: f"URSoftware {'.'.join(map(str, SOFTWARE_VERSION))} (Jan 01 2024)",
+    "polyscopeversion": _version,
     "get serial number": lambda _: _SERIAL,
     "get robot model": lambda _: "UR5",
-    "is in remote control": lambda _: "true",
+    "is in remote control": lambda controller: str(not controller.local_mode).lower(),
     "close popup": lambda _: "closing popup",
     "close safety popup": lambda _: "closing safety popup",
     "quit": lambda _: "Disconnected",

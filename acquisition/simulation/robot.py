@@ -2,9 +2,7 @@
 
 It serves RTDE (port 30004), the script port (30003, 30002) and the dashboard (29999) on any address of the
 loopback network, so that several arms can live beside each other: ``python -m acquisition.simulation.robot
---host 127.0.0.5``. Commands on stdin, one a line: ``pstop``, ``estop``, ``clear``, ``stall`` and ``unstall``
-(the stream falls silent and comes back), ``drop`` (every RTDE connection is cut), ``slow SECONDS`` (packages
-leave up to that much late), ``jump SECONDS`` (the controller's clock is set), ``state``.
+--host 127.0.0.5``. Faults are commanded on stdin, one a line; `acquisition.simulation.faults` has them all.
 """
 
 from __future__ import annotations
@@ -17,15 +15,16 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
 
 from acquisition.process import ChildProcess, die_with_parent, serve_commands
 from acquisition.robots.rtde import PORT as RTDE_PORT
 from acquisition.simulation.arm import HOME
-from acquisition.simulation.controller import INPUTS, OUTPUTS, SOFTWARE_VERSION, Controller
+from acquisition.simulation.controller import INPUTS, SOFTWARE, Controller
 from acquisition.simulation.dashboard import serve_dashboard
+from acquisition.simulation.faults import FaultConsole
+from acquisition.simulation.ports import Ports
 from acquisition.simulation.rtde_server import RtdeServer
-from dataset.errors import DeviceError, ToolkitError
+from dataset.errors import ToolkitError
 
 SCRIPT_PORTS = (30003, 30002)
 DASHBOARD_PORT = 29999
@@ -42,11 +41,19 @@ class SimulatedRobot(ChildProcess):
         host: loopback address to serve at; each arm needs its own.
         rate_hz: of the control loop, and the highest rate a client gets.
         drift_ppm: how much faster than the host's clock the controller's clock runs.
+        software: version of PolyScope that it passes for; one before 5.5.1 does not tell tool and payload.
     """
 
-    def __init__(self, host: str = "127.0.0.1", rate_hz: float = 500.0, drift_ppm: float = 0.0) -> None:
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        rate_hz: float = 500.0,
+        drift_ppm: float = 0.0,
+        software: tuple[int, int, int] = SOFTWARE,
+    ) -> None:
         self.host = host
         arguments = ["--host", host, "--rate", f"{rate_hz}", "--drift-ppm", f"{drift_ppm}"]
+        arguments += ["--software", ".".join(map(str, software))]
         super().__init__("acquisition.simulation.robot", arguments)
 
 
@@ -59,47 +66,27 @@ def main() -> int:
     parser.add_argument("--host", default="127.0.0.1", help="address to serve at (127.0.0.1)")
     parser.add_argument("--rate", type=float, default=500.0, help="control rate, Hz (500)")
     parser.add_argument("--drift-ppm", type=float, default=0.0, help="error of the controller's clock (0)")
+    parser.add_argument("--software", type=_version, default=SOFTWARE, help="PolyScope version (5.12.4)")
     options = parser.parse_args()
-    controller = Controller(options.rate, options.drift_ppm, HOME)
-    rtde = RtdeServer(OUTPUTS, INPUTS, controller.write_input, SOFTWARE_VERSION, options.rate)
+    controller = Controller(options.rate, options.drift_ppm, HOME, options.software)
+    rtde = RtdeServer(controller.outputs, INPUTS, controller.write_input, controller.software, options.rate)
+    ports = Ports(options.host)
     try:
-        _listen(options.host, RTDE_PORT, rtde.serve)
+        ports.listen(RTDE_PORT, rtde.serve)
         for port in SCRIPT_PORTS:
-            _listen(options.host, port, lambda connection: _serve_scripts(controller, connection))
-        _listen(options.host, DASHBOARD_PORT, lambda connection: serve_dashboard(controller, connection))
+            ports.listen(port, lambda connection: _serve_scripts(controller, connection))
+        ports.listen(DASHBOARD_PORT, lambda connection: serve_dashboard(controller, connection))
     except ToolkitError as error:
         print(error, file=sys.stderr)
         return 2
     threading.Thread(target=_run, args=(controller, rtde), daemon=True).start()
-    serve_commands(lambda line: handle_fault(controller, rtde, line))
+    serve_commands(FaultConsole(controller, rtde, ports).handle)
     return 0
 
 
-def handle_fault(controller: Controller, rtde: RtdeServer, line: str) -> str:
-    """Carries out one command of the fault console. Raises ValueError for one that it does not know."""
-    verb, *arguments = line.split()
-    switches: dict[str, Callable[[], None]] = {
-        "pstop": controller.protective_stop,
-        "estop": controller.emergency_stop,
-        "clear": controller.clear,
-        "drop": rtde.drop,
-    }
-    if verb in switches and not arguments:
-        switches[verb]()
-    elif verb in ("stall", "unstall") and not arguments:
-        rtde.stalled = verb == "stall"
-    elif verb == "slow" and len(arguments) == 1:
-        rtde.lateness_s = max(0.0, float(arguments[0]))
-    elif verb == "jump" and len(arguments) == 1:
-        controller.jump_clock(float(arguments[0]))
-    elif verb == "state" and not arguments:
-        arm = controller.arm
-        return f"safety_bits={arm.safety_bits} program={controller.program_running} stop={arm.last_stop!r}"
-    else:
-        raise ValueError(
-            f"unknown command '{line}'; use pstop, estop, clear, stall, unstall, drop, slow S, jump S, state"
-        )
-    return ""
+def _version(text: str) -> tuple[int, int, int]:
+    major, minor, bugfix = map(int, text.split("."))
+    return major, minor, bugfix
 
 
 def _run(controller: Controller, rtde: RtdeServer) -> None:
@@ -133,32 +120,6 @@ def _serve_scripts(controller: Controller, connection: socket.socket) -> None:
                 break
             program, text = text[: end.end()], text[end.end() :]
             controller.load_program(program)
-
-
-def _listen(host: str, port: int, serve: Callable[[socket.socket], None]) -> None:
-    listener = socket.socket()
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-    except OSError as error:
-        raise DeviceError(
-            f"cannot serve a simulated arm at {host}:{port} ({error}); is another one running there? "
-            "Use another --host such as 127.0.0.7"
-        ) from error
-    listener.listen(16)
-    threading.Thread(target=_accept, args=(listener, serve), daemon=True).start()
-
-
-def _accept(listener: socket.socket, serve: Callable[[socket.socket], None]) -> None:
-    while True:
-        connection, _ = listener.accept()
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        threading.Thread(target=_converse, args=(connection, serve), daemon=True).start()
-
-
-def _converse(connection: socket.socket, serve: Callable[[socket.socket], None]) -> None:
-    with connection, contextlib.suppress(OSError, DeviceError):  # however the client goes away
-        serve(connection)
 
 
 if __name__ == "__main__":

@@ -43,7 +43,9 @@ class RtdeServer:
         self._version = version
         self._rate_hz = rate_hz
         self._clients: list[_Client] = []
+        self._last: Mapping[str, Value] = {}
         self.stalled = False  # True: nothing is sent, the connections stay open
+        self.hung = False  # True: the same state is sent again and again
         self.lateness_s = 0.0  # packages leave up to this much late, at random, in order
 
     def serve(self, connection: socket.socket) -> None:
@@ -61,9 +63,13 @@ class RtdeServer:
 
     def publish(self, values: Mapping[str, Value], now_s: float) -> None:
         """Sends the state to every client whose turn it is. `now_s` is the host's monotonic clock."""
+        if not self.hung:
+            self._last = dict(values)
         for client in list(self._clients):
             if client.due(self._rate_hz) and not self.stalled:
-                client.queue(values, now_s + random.uniform(0.0, self.lateness_s))
+                client.queue(
+                    self._last if self.hung else values, now_s + random.uniform(0.0, self.lateness_s)
+                )
             client.flush(now_s)
 
     def drop(self) -> None:

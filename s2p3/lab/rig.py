@@ -23,6 +23,7 @@ def lab_rig(frame_rate: float, camera_address: str = "127.0.0.1", arm_host: str 
         robot=RobotTable(
             host=arm_host,
             frequency_hz=_FREQUENCY_HZ,
+            silence_s=1.0,  # simulators share a busy host with what they serve
             speed=0.35,
             joint_speed=0.9,
             joint_acceleration=1.2,

@@ -22,7 +22,8 @@ from acquisition.kinematics import forward
 from acquisition.recorder import NO_CAMERA, Progress, record_stills, record_stream, record_touches
 from acquisition.robot import RobotConfig
 from acquisition.robots.rtde import RtdeReader
-from acquisition.robots.ur import UrReceiver, UrRobot
+from acquisition.robots.ur import UrRobot
+from acquisition.robots.ur_receiver import UrReceiver
 from acquisition.simulation.camera import SimulatedCamera
 from acquisition.simulation.patterns import MovingPattern
 from acquisition.simulation.robot import SimulatedRobot
@@ -38,7 +39,11 @@ pytestmark = pytest.mark.devices
 
 CAMERA = CameraConfig("127.0.0.1", exposure_us=4_000)
 ARM = RobotConfig(
-    "127.0.0.31", tcp_offset=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0), joint_speed=1.0, joint_acceleration=4.0
+    "127.0.0.31",
+    silence_s=1.0,
+    tcp_offset=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0),
+    joint_speed=1.0,
+    joint_acceleration=4.0,
 )
 HOME = np.array([3.14, -1.57, 1.57, -1.57, -1.57, 0.0])
 PATH = HOME + np.outer(np.arange(1, 7), [0.05, -0.03, 0.03, 0.02, 0.03, 0.05])
@@ -279,7 +284,7 @@ def test_a_lost_arm_keeps_frames_and_poses_until_then(tmp_path: Path, camera: Ar
     host = "127.0.0.32"
     with (
         SimulatedRobot(host) as arm,
-        UrReceiver(RobotConfig(host, tcp_offset=(0.0,) * 6)) as source,
+        UrReceiver(RobotConfig(host, tcp_offset=(0.0,) * 6, silence_s=1.0)) as source,
         pytest.raises(DeviceError, match=host),
         SessionWriter(tmp_path / "s.h5", "sequence", camera.info) as writer,
     ):
@@ -305,7 +310,7 @@ from dataset.session import SessionWriter
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the suite runs in the background
 arguments = json.loads(sys.argv[1])
 path = np.tile(np.array(arguments["path"]), (20, 1))
-robot_config = RobotConfig(arguments["host"], tcp_offset=(0.0,) * 6, joint_acceleration=4.0)
+robot_config = RobotConfig(arguments["host"], tcp_offset=(0.0,) * 6, silence_s=1.0, joint_acceleration=4.0)
 
 def tell(progress):
     if progress.frames > 150:
@@ -336,7 +341,7 @@ def test_an_interrupted_stream_opens_with_all_until_then(
     assert process.returncode not in (0, None)
     if number == signal.SIGINT:
         assert errors.strip().splitlines()[-1] == "KeyboardInterrupt"
-        with UrReceiver(RobotConfig(ARM.host, tcp_offset=(0.0,) * 6)) as receiver:
+        with UrReceiver(RobotConfig(ARM.host, tcp_offset=(0.0,) * 6, silence_s=1.0)) as receiver:
             receiver.wait_until_still(timeout_s=2.0)
     with Session.open(out) as session:
         assert not session.complete

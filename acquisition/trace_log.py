@@ -46,6 +46,7 @@ class TraceLog:
         if self._source is None:
             return
         if error is None:
+            self._store(self._source, self._source.take_trace)  # kept even where the arm was lost at the end
             self._store(self._source, self._source.stop_trace)
             return
         # The error under way is the one the user must see.
@@ -65,7 +66,7 @@ class TraceLog:
     def _store(self, source: PoseSource, take: Callable[[], RobotTrace]) -> RobotTrace:
         with self._lock:  # two threads that take and store in turns would mix the order
             trace = take()
-            self._writer.add_robot_trace(trace, source.tcp_offset)
+            self._writer.add_robot_trace(trace, source.tcp_offset, source.payload)
         return trace
 
 

@@ -184,6 +184,14 @@ DATASETS: tuple[Dataset, ...] = (
         "flange<-tcp as x y z and a rotation vector; NaN: unknown",
     ),
     Dataset(
+        "robot/payload",
+        ("f8",),
+        (4,),
+        "kg, m",
+        "What the arm reckoned with: mass, and its centre in the flange frame; NaN: not told",
+        required=False,
+    ),
+    Dataset(
         "clocks/camera", ("f8",), (3,), "ns, 1, ns", "a, b, sigma of host = a + b camera; NaN: see pieces"
     ),
     Dataset("clocks/robot", ("f8",), (3,), "ns, 1, ns", "a, b, sigma of host = a + b robot; NaN: see pieces"),
@@ -281,7 +289,14 @@ DATASETS: tuple[Dataset, ...] = (
         chunk=1,
         compressed=True,
     ),
-    Dataset("poses/objects/*/mask_crc32", ("u4",), ("N",), "1", "CRC-32 of the mask's bytes, row by row"),
+    Dataset(
+        "poses/objects/*/mask_crc32",
+        ("u4",),
+        ("N",),
+        "1",
+        "CRC-32 of the mask's bytes, row by row; schema 1.0 had none",
+        required=False,
+    ),
     Dataset("splits/*", ("i8",), ("k",), "1", "Frame indices of a split, increasing", required=False),
 )
 

@@ -26,7 +26,12 @@ GROWING: tuple[str, ...] = (
 )
 """Datasets that grow while a session is recorded, beside the frames themselves."""
 
-BEGINNING: tuple[tuple[str, int], ...] = (("robot/tcp_offset", 6), ("clocks/camera", 3), ("clocks/robot", 3))
+BEGINNING: tuple[tuple[str, int], ...] = (
+    ("robot/tcp_offset", 6),
+    ("robot/payload", 4),
+    ("clocks/camera", 3),
+    ("clocks/robot", 3),
+)
 """Datasets of a fixed size that are filled while a session is recorded, and their sizes."""
 
 _COMPUTED = ("poses", "splits", "depth")
@@ -74,7 +79,7 @@ def _why_not(file: h5py.File, kind: str, camera: CameraInfo) -> str | None:
             return f"its camera has {name} {found}, this one {expected}"
     if not host_boot_id() or attribute(file, "host_boot_id") != host_boot_id():
         return "it was recorded before this computer was restarted, on another one or by an older toolkit"
-    if any(name not in file for name in GROWING):
+    if any(name not in file for name in (*GROWING, *(name for name, _ in BEGINNING))):
         return "it was written by an older toolkit"
     computed = [name for name in _COMPUTED if name in file]
     if computed:

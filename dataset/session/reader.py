@@ -218,6 +218,15 @@ class Session:
         return offset if np.isfinite(offset).all() else None
 
     @cached_property
+    def payload(self) -> NDArray[np.float64] | None:
+        """(4,) what the arm reckoned with: mass, kg, and its centre in the flange frame, metres; None where
+        the arm did not tell."""
+        if not self.contents.has("robot/payload"):
+            return None
+        payload: NDArray[np.float64] = self.contents.read("robot/payload")
+        return payload if np.isfinite(payload).all() else None
+
+    @cached_property
     def clocks(self) -> Clocks:
         """The fits of the camera's and the robot's clock to the host's."""
         return Clocks(self._clock("camera"), self._clock("robot"))

@@ -106,6 +106,7 @@ class SessionWriter:
         self._frames, self._samples = len(file["camera/raw"]), len(file["robot/host_time_ns"])
         self._drops, self._pauses = len(file["camera/drops"]), len(file["camera/pauses"])
         self._last_id = int(file["camera/frame_id"][-1]) if self._frames else None
+        self._clock_epoch: int | None = None
         gaps = np.append(file["camera/drops"]["frame_id"], file["camera/pauses"]["last_id"])
         self.last_known_id = None if self._last_id is None else int(max(self._last_id, *gaps, -1))
         file.swmr_mode = True
@@ -153,6 +154,9 @@ class SessionWriter:
                     "counter and hand frames over in order"
                 )
             index = self._frames
+            if self._clock_epoch is not None and frame.clock_epoch != self._clock_epoch:
+                begin_segment(file, index, self._samples)
+            self._clock_epoch = frame.clock_epoch
             raw = file["camera/raw"]
             raw.resize(index + 1, axis=0)
             raw.id.write_direct_chunk((index, 0, 0), chunk.data)
@@ -190,12 +194,15 @@ class SessionWriter:
             file.flush()
             self._pauses += 1
 
-    def add_robot_trace(self, trace: RobotTrace, tcp_offset: ArrayLike) -> None:
+    def add_robot_trace(
+        self, trace: RobotTrace, tcp_offset: ArrayLike, payload: ArrayLike | None = None
+    ) -> None:
         """Appends robot samples; call it once at the end, or again and again with what is new.
 
         Args:
             trace: M samples.
             tcp_offset: (6,) flange<-tcp as [x y z rx ry rz], metres and rotation vector.
+            payload: (4,) mass, kg, and its centre in the flange frame, metres; None where it is not known.
         """
         tool = np.asarray(tcp_offset, dtype=np.float64)
         with self._writing("the robot trace") as file:
@@ -206,6 +213,8 @@ class SessionWriter:
                     f"{self.path}: the arm's tool offset is not the one that the session began with; set it "
                     "back at the pendant or in the rig file, or record to a new file"
                 )
+            if payload is not None:
+                file["robot/payload"][:] = np.asarray(payload, dtype=np.float64)
             for name in ROBOT_COLUMNS:
                 _put(file[f"robot/{name}"], self._samples, getattr(trace, name))
             file.flush()

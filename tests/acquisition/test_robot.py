@@ -17,14 +17,17 @@ import numpy as np
 import pytest
 
 from acquisition.kinematics import forward
+from acquisition.recorder import NO_CAMERA
 from acquisition.robot import EmergencyStop, ProtectiveStop, Robot, RobotConfig
 from acquisition.robots.limits import MotionLimits
 from acquisition.robots.stream import safety_error
 from acquisition.robots.ur import UrRobot
 from acquisition.robots.ur_receiver import UrReceiver
 from acquisition.simulation.robot import SimulatedRobot
+from acquisition.trace_log import TraceLog
 from dataset.errors import DeviceError, ToolkitError
 from dataset.frames import RobotTrace
+from dataset.session import Session, SessionWriter
 from dataset.transforms import SE3, translation_error_mm
 
 TCP = (0.0, 0.0, 0.1, 0.0, 0.3, 0.0)
@@ -165,6 +168,43 @@ class TestToolAndPayload:
         time.sleep(0.05)
         np.testing.assert_allclose(robot.payload, [1.25, 0.01, -0.02, 0.05])
         arm.command("payload 0 0 0 0")
+
+    def test_a_session_holds_tool_and_payload(
+        self, arm: SimulatedRobot, robot: UrRobot, tmp_path: Path
+    ) -> None:
+        arm.command("payload 0.8 0 0 0.04")
+        with (
+            UrReceiver(config(arm)) as reader,
+            SessionWriter(tmp_path / "s.h5", "tool_tip", NO_CAMERA) as writer,
+            TraceLog(reader, writer),
+        ):
+            time.sleep(0.2)
+        with Session.open(tmp_path / "s.h5") as session:
+            assert session.payload is not None
+            np.testing.assert_allclose(session.payload, [0.8, 0, 0, 0.04])
+            np.testing.assert_allclose(session.tcp_offset, TCP)
+        arm.command("payload 0 0 0 0")
+
+    def test_an_arm_lost_at_the_very_end_leaves_its_samples(
+        self, arm: SimulatedRobot, robot: UrRobot, tmp_path: Path
+    ) -> None:
+        def record() -> None:
+            with (
+                UrReceiver(config(arm)) as reader,
+                SessionWriter(tmp_path / "s.h5", "tool_tip", NO_CAMERA) as writer,
+                TraceLog(reader, writer),
+            ):
+                time.sleep(0.3)
+                arm.command("tcp 0 0 0.2 0 0.3 0")
+                time.sleep(0.1)
+
+        with pytest.raises(DeviceError, match="incomplete after"):
+            record()
+        arm.command(f"tcp {' '.join(map(str, TCP))}")
+        with Session.open(tmp_path / "s.h5") as session:
+            assert not session.complete
+            assert session.robot is not None
+            assert len(session.robot) > 100
 
     def test_a_wrong_tool_is_noticed(self, arm: SimulatedRobot, robot: UrRobot) -> None:
         with pytest.raises(DeviceError, match=r"the rig file says .*; check tcp_offset"):

@@ -15,8 +15,9 @@ demo: $(VENV)/.ready           ## the main job on the simulated lab, about 23 mi
 quick: $(VENV)/.ready          ## the same in under five minutes; it shows the way, not the accuracy
 	$(BIN)/s2p3 demo --quick --out out/quick
 
-test: $(VENV)/.ready
-	$(BIN)/pytest
+test: $(VENV)/.ready           ## all but the devices' tests side by side, one thread each; then those, one after another
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile -m "not devices"
+	$(BIN)/pytest -m devices
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff format --check .

@@ -8,19 +8,27 @@ are off.
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
 
 from acquisition.aravis_library import load_aravis
-from acquisition.camera import Camera, CameraConfig, CameraStatistics, Trigger
-from acquisition.cameras.aravis_stream import FrameGrabber, StreamSettings
-from acquisition.cameras.gvcp import probe, wait_for_control
+from acquisition.camera import Camera, CameraConfig, CameraLost, CameraStatistics, Trigger
+from acquisition.cameras import settings
+from acquisition.cameras.aravis_features import AravisFeatures
+from acquisition.cameras.aravis_stream import FrameGrabber
+from acquisition.cameras.clock_epochs import ClockEpochs
+from acquisition.cameras.frame_ids import FrameIds
+from acquisition.cameras.frame_queue import FrameQueue
+from acquisition.cameras.gvcp import path_mtu, probe, wait_for_control
 from dataset.errors import DeviceError
 from dataset.frames import CameraInfo, RawFrame
-from dataset.pixel_formats import pixel_format
 
-_AUTOMATIC = ("ExposureAuto", "GainAuto", "BalanceWhiteAuto")
+_PATIENCE_S = 0.5
+"""Silence after which the camera is asked whether it is still there."""
+
+_RETRY_S = 0.5
 
 
 class AravisCamera(Camera):
@@ -34,20 +42,16 @@ class AravisCamera(Camera):
         """
         self._config = config
         self._aravis, self._error = load_aravis()
+        self._camera: Any = None
+        self._features = AravisFeatures(self._name, self._error)
         self._grabber: FrameGrabber | None = None
-        self._stream: Any = None
         self._trigger: Trigger = config.trigger
-        self._final = CameraStatistics()
-        self._gone = False
-        presence = wait_for_control(config.address)
-        with self._explain("could not be opened", "check the cable and try again"):
-            self._camera = self._aravis.Camera.new(presence.ip)
-        try:
-            self._claim()
-            self._info = self._configure()
-        except BaseException:
-            self.close()
-            raise
+        self._frames = FrameQueue()
+        self._ids = FrameIds()
+        self._epochs = ClockEpochs()
+        self._underruns = 0
+        self._lost = False
+        self._open()
 
     @property
     def info(self) -> CameraInfo:
@@ -57,52 +61,41 @@ class AravisCamera(Camera):
     @property
     def statistics(self) -> CameraStatistics:
         """See `Camera.statistics`."""
-        return self._grabber.statistics if self._grabber is not None else self._final
+        running = self._grabber.counted("n_underruns") if self._grabber is not None else 0
+        return self._frames.statistics(self._underruns + running)
 
     def start(self, trigger: Trigger | None = None) -> None:
         """See `Camera.start`."""
         if self._grabber is not None:
             raise DeviceError(f"{self._name} is already started; stop it first")
+        self._frames, self._ids, self._underruns = FrameQueue(), FrameIds(), 0
         self._trigger = trigger or self._config.trigger
-        with self._explain("could not be started", "check the cable and try again"):
-            if self._trigger == "software":
-                self._camera.set_trigger("Software")
-            else:
-                self._camera.clear_triggers()
-                self._set_frame_rate()
-            settings = StreamSettings(
-                format=pixel_format(self._config.pixel_format),
-                height=self._info.height,
-                width=self._info.width,
-                payload=self._camera.get_payload(),
-                exposure_us=self._camera.get_exposure_time(),
-                gain_db=self._camera.get_gain(),
-            )
-            self._stream = self._camera.create_stream(None, None)
-            # Without the right to raw sockets Aravis reads UDP, for which the usual buffer is too small.
-            self._stream.set_property("socket-buffer", self._aravis.GvStreamSocketBuffer.AUTO)
-            grabber = FrameGrabber(self._aravis, self._stream, settings)
-            self._camera.start_acquisition()
-        self._grabber = grabber
-        grabber.start()
+        self._go()
 
     def trigger(self) -> None:
         """See `Camera.trigger`."""
-        grabber = self._started()
+        self._started()
         if self._trigger != "software":
-            raise DeviceError(f"{self._name} runs free; start it with trigger 'software' to trigger it")
-        grabber.discard_until(time.monotonic_ns())
-        with self._explain("did not take the trigger", "check the cable, then open it again"):
-            self._camera.software_trigger()
+            raise DeviceError(
+                f"{self._name} does not wait for software triggers; start it with trigger 'software'"
+            )
+        self._frames.discard_until(time.monotonic_ns())
+        self._features.execute("TriggerSoftware")
 
     def read(self, timeout_s: float | None = None) -> RawFrame:
-        """See `Camera.read`."""
+        """See `Camera.read`; a camera that is gone is noticed within 2 s."""
         grabber = self._started()
         timeout_s = self._config.timeout_s if timeout_s is None else timeout_s
-        frame = grabber.take(timeout_s)
-        if frame is None:
-            raise self._explain_silence(grabber, timeout_s)
-        return frame
+        deadline = time.monotonic() + timeout_s
+        while True:
+            remaining_s = deadline - time.monotonic()
+            frame = self._frames.take(min(max(0.0, remaining_s), _PATIENCE_S))
+            if frame is not None:
+                self._lost = False
+                return frame
+            self._check_presence()
+            if remaining_s <= _PATIENCE_S:
+                raise self._explain_silence(grabber, timeout_s)
 
     def stop(self) -> None:
         """See `Camera.stop`."""
@@ -110,27 +103,65 @@ class AravisCamera(Camera):
             return
         grabber, self._grabber = self._grabber, None
         # Each word to a camera that is gone costs seconds; what remains then is to let go of our side.
-        if not self._gone:
+        if not self._lost:
             with contextlib.suppress(self._error):
                 self._camera.stop_acquisition()
-        self._final = grabber.statistics
-        grabber.stop()
-        self._stream.set_emit_signals(False)
-        self._stream = None
+        self._underruns += grabber.counted("n_underruns")
+        self._let_go([grabber.stop()])
 
     def close(self) -> None:
-        """See `Camera.close`; takes about 8 s when the camera has vanished: Aravis tries to tell it."""
+        """See `Camera.close`. Aravis goes on for about 8 s to tell a camera that is gone: in a thread."""
         self.stop()
+        objects = [self._camera, self._features.detach()]
         self._camera = None
+        self._let_go(objects)
+
+    def reconnect(self, timeout_s: float = 15.0) -> None:
+        """See `Camera.reconnect`."""
+        started, before = self._grabber is not None, self._info
+        self.close()
+        self._lost = False
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                self._open()
+                break
+            except DeviceError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(_RETRY_S)
+        if (self._info.model, self._info.serial) != (before.model, before.serial):
+            self.close()
+            raise DeviceError(
+                f"{self._name} is {self._info.model} {self._info.serial} now and was {before.model} "
+                f"{before.serial}; give each camera an address of its own"
+            )
+        self._ids.resume()
+        self._epochs.restart()
+        if started:
+            self._go()
 
     @property
     def _name(self) -> str:
         return f"the camera at {self._config.address}"
 
-    def _started(self) -> FrameGrabber:
-        if self._grabber is None:
-            raise DeviceError(f"{self._name} is not started; call start() first")
-        return self._grabber
+    def _open(self) -> None:
+        config = self._config
+        presence = wait_for_control(config.address)
+        with self._explain("could not be opened", "check the cable and try again"):
+            self._camera = self._aravis.Camera.new(presence.ip)
+        try:
+            self._claim()
+            self._features.attach(self._camera.get_device())
+            with self._explain("could not be stopped", "check the cable and try again"):
+                self._camera.stop_acquisition()  # a client that died may have left it running
+            image = settings.configure(self._features, config)
+            if config.ptp:
+                settings.synchronize(self._features, config.ptp_timeout_s)
+            self._info = self._describe(image, self._set_packet_size(presence.ip))
+        except BaseException:
+            self.close()
+            raise
 
     def _claim(self) -> None:
         device = self._camera.get_device()
@@ -140,106 +171,95 @@ class AravisCamera(Camera):
         device.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
         device.set_access_check_policy(self._aravis.AccessCheckPolicy.ENABLE)
 
-    def _configure(self) -> CameraInfo:
-        config, camera = self._config, self._camera
-        format_ = pixel_format(config.pixel_format)
-        with self._explain("did not take its settings", "check the cable and try again"):
-            camera.stop_acquisition()  # a client that died may have left it running
-            if config.pixel_format not in camera.dup_available_pixel_formats_as_strings():
-                offered = ", ".join(camera.dup_available_pixel_formats_as_strings())
-                raise DeviceError(
-                    f"{self._name} has no pixel format {config.pixel_format}; it offers {offered}"
-                )
-            camera.set_pixel_format_from_string(config.pixel_format)
-            self._read_whole_sensor()
-            self._lock_automatic()
-            self._set_within("exposure_us", config.exposure_us, "ExposureTime")
-            self._set_within("gain_db", config.gain_db, "Gain")
-            self._set_frame_rate()
-            packet_size = self._set_packet_size()
-            device = camera.get_device()
-            firmware = "DeviceFirmwareVersion"
-            if not device.is_feature_available(firmware):
-                firmware = "DeviceVersion"
+    def _describe(self, image: settings.ImageSettings, packet_size: int) -> CameraInfo:
+        features = self._features
+        firmware = "DeviceFirmwareVersion" if features.has("DeviceFirmwareVersion") else "DeviceVersion"
+        with self._explain("did not say which it is", "check the cable and try again"):
             return CameraInfo(
-                vendor=camera.get_vendor_name(),
-                model=camera.get_model_name(),
-                serial=camera.get_device_serial_number(),
-                firmware=device.get_string_feature_value(firmware),
-                pixel_format=format_.name,
-                mosaic="colour" if format_.colour else "mono",
-                width=camera.get_integer("Width"),
-                height=camera.get_integer("Height"),
-                bits=format_.bits,
+                vendor=self._camera.get_vendor_name(),
+                model=self._camera.get_model_name(),
+                serial=self._camera.get_device_serial_number(),
+                firmware=features.get(firmware, str),
+                pixel_format=image.format.name,
+                mosaic="colour" if image.format.colour else "mono",
+                width=image.width,
+                height=image.height,
+                bits=image.format.bits,
                 packet_size=packet_size,
             )
 
-    def _read_whole_sensor(self) -> None:
-        """A region left by another client would shift the mosaic against the calibration."""
-        for offset, size in (("OffsetX", "Width"), ("OffsetY", "Height")):
-            if self._camera.get_device().is_feature_available(offset):
-                self._camera.set_integer(offset, 0)
-            _, largest = self._camera.get_integer_bounds(size)
-            self._camera.set_integer(size, largest)
+    def _set_packet_size(self, ip: str) -> int:
+        """Sets the configured size, or the largest that test packets show to arrive."""
+        config = self._config
+        with self._explain("did not take the packet size", "set packet_size in the rig file"):
+            if config.packet_size is not None:
+                self._camera.gv_set_packet_size_adjustment(self._aravis.GvPacketSizeAdjustment.NEVER)
+                self._camera.gv_set_packet_size(config.packet_size)
+            elif self._features.has("GevSCPSFireTestPacket"):
+                self._camera.gv_auto_packet_size()
+            else:
+                # A camera without test packets: no packet can be larger than the way to it lets through.
+                mtu = path_mtu(ip) // 4 * 4
+                self._camera.gv_set_packet_size(min(self._camera.gv_get_packet_size(), mtu))
+            return int(self._camera.gv_get_packet_size())
 
-    def _lock_automatic(self) -> None:
-        for feature in _AUTOMATIC:
-            if not self._camera.get_device().is_feature_available(feature):
-                continue
-            self._camera.set_string(feature, "Off")
-            if self._camera.get_string(feature) != "Off":
-                raise DeviceError(
-                    f"{self._name} does not let go of {feature}; set it to Off in the maker's software, save "
-                    "that as the power-on setting, then try again"
-                )
+    def _go(self) -> None:
+        """Starts the acquisition with the queue, ids and clock there are."""
+        features, config = self._features, self._config
+        settings.set_trigger(features, self._trigger, config.trigger_line)
+        if self._trigger == "free":
+            settings.set_frame_rate(features, config.frame_rate)
+        image = settings.image_settings(features, config)
+        with self._explain("could not be started", "check the cable and try again"):
+            stream = self._camera.create_stream(None, None)
+            # Without the right to raw sockets Aravis reads UDP, for which the usual buffer is too small.
+            stream.set_property("socket-buffer", self._aravis.GvStreamSocketBuffer.AUTO)
+            grabber = FrameGrabber(self._aravis, stream, image, self._frames, self._ids, self._epochs)
+            self._camera.start_acquisition()
+        self._grabber = grabber
+        grabber.start()
 
-    def _set_frame_rate(self) -> None:
-        rate = self._config.frame_rate
-        if rate is None:
-            return
-        # Cameras keep the rate read-only until it is enabled.
-        if self._camera.get_device().is_feature_available("AcquisitionFrameRateEnable"):
-            self._camera.set_boolean("AcquisitionFrameRateEnable", True)
-        self._set_within("frame_rate", rate, "AcquisitionFrameRate")
+    def _started(self) -> FrameGrabber:
+        if self._grabber is None:
+            raise DeviceError(f"{self._name} is not started; call start() first")
+        return self._grabber
 
-    def _set_within(self, name: str, value: float, feature: str) -> None:
-        lowest, highest = self._camera.get_float_bounds(feature)
-        if not lowest <= value <= highest:
-            raise DeviceError(
-                f"{self._name} cannot take {name} = {value:g}: its {feature} goes from {lowest:g} to "
-                f"{highest:g}; correct [camera] in the rig file"
-            )
-        self._camera.set_float(feature, value)
+    def _let_go(self, objects: list[Any]) -> None:
+        """Drops the last references to Aravis' objects, which then say goodbye to the camera: in a thread of
+        its own where nobody listens."""
+        if self._lost:
+            threading.Thread(target=objects.clear, name="let-go-of-camera", daemon=True).start()
 
-    def _set_packet_size(self) -> int:
-        if self._config.packet_size is None:
-            return int(self._camera.gv_auto_packet_size())
-        never = self._aravis.GvPacketSizeAdjustment.NEVER
-        self._camera.gv_set_packet_size_adjustment(never)
-        self._camera.gv_set_packet_size(self._config.packet_size)
-        return int(self._camera.gv_get_packet_size())
-
-    def _explain_silence(self, grabber: FrameGrabber, timeout_s: float) -> DeviceError:
-        """Why no frame came."""
+    def _check_presence(self) -> None:
+        """Raises CameraLost when the camera does not answer or is not ours any more."""
         try:
             presence = probe(self._config.address)
         except DeviceError as error:
-            self._gone = True
-            return DeviceError(
+            self._lost = True
+            raise CameraLost(
                 f"{self._name} stopped answering; check its power and cable, then open it again ({error})"
-            )
-        if not presence.controlled:
-            return DeviceError(
+            ) from error
+        if not presence.controlled or not self._camera.get_device().is_controller():
+            self._lost = True
+            raise CameraLost(
                 f"{self._name} was restarted, or lost sight of this computer for seconds; open it again"
             )
-        statistics = grabber.statistics
+
+    def _explain_silence(self, grabber: FrameGrabber, timeout_s: float) -> DeviceError:
+        """Why no frame came from a camera that is there."""
+        statistics = self.statistics
         start = f"no whole frame from {self._name} within {timeout_s:g} s"
         if statistics.incomplete:
             return DeviceError(
                 f"{start}: {statistics.incomplete} frames came with packets missing; set packet_size to the "
                 "MTU (ip link), raise net.core.rmem_max, or lower the frame rate"
             )
-        if grabber.received_packets == 0:
+        if statistics.underruns:
+            return DeviceError(
+                f"{start}: {statistics.underruns} frames found no free buffer; read more often, or lower the "
+                "frame rate"
+            )
+        if grabber.counted("n_received_packets") == 0:
             return DeviceError(
                 f"{start}: not one packet of the stream arrived; check that the firewall lets UDP through, "
                 "that the MTU (ip link) is at least packet_size, and that a trigger came if it waits for one"

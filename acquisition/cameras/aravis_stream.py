@@ -4,60 +4,52 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acquisition.camera import CameraStatistics
+from acquisition.cameras.clock_epochs import ClockEpochs
 from acquisition.cameras.frame_ids import FrameIds
+from acquisition.cameras.frame_queue import FrameQueue
+from acquisition.cameras.settings import ImageSettings
 from dataset.errors import ToolkitError
 from dataset.frames import RawFrame
-from dataset.pixel_formats import PixelFormat, unpack
+from dataset.pixel_formats import unpack
 
 _BUFFERS = 12  # received while the grab thread waits for its turn: half a second at full rate
-_QUEUE = 16
 _POLL_US = 100_000
 _CLOCK_READINGS = 3
-
-
-@dataclass(frozen=True)
-class StreamSettings:
-    """What every frame of an acquisition has in common."""
-
-    format: PixelFormat
-    height: int
-    width: int
-    payload: int
-    exposure_us: float
-    gain_db: float
 
 
 class FrameGrabber:
     """Pops finished buffers in a thread of its own, unpacks the whole ones, and counts the others.
 
-    A frame that nobody reads is dropped when `_QUEUE` newer ones wait; its id is missing in what is read.
+    Aravis writes the packets straight into our buffers; a frame leaves them in the one copy that unpacks it.
     """
 
-    def __init__(self, aravis: Any, stream: Any, settings: StreamSettings) -> None:
+    def __init__(
+        self,
+        aravis: Any,
+        stream: Any,
+        settings: ImageSettings,
+        frames: FrameQueue,
+        ids: FrameIds,
+        epochs: ClockEpochs,
+    ) -> None:
         """Hands its buffers to `stream`, an Aravis.Stream whose acquisition has not started."""
         self._success = aravis.BufferStatus.SUCCESS
         self._stream = stream
         self._settings = settings
-        self._ids = FrameIds()
+        self._frames = frames
+        self._ids = ids
+        self._epochs = epochs
         self._memory: dict[Any, NDArray[np.uint8]] = {}
         for _ in range(_BUFFERS):
             memory = np.empty(settings.payload, np.uint8)
             buffer = aravis.Buffer.new(memory.size, memory.ctypes.data)
             self._memory[buffer] = memory
             stream.push_buffer(buffer)
-        self._frames: deque[RawFrame] = deque()
-        self._arrived = threading.Condition()
-        self._not_before_ns = 0
-        self._good = self._incomplete = self._discarded = 0
-        self._failure: ToolkitError | None = None
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="camera-grabber", daemon=True)
 
@@ -65,41 +57,17 @@ class FrameGrabber:
         """Starts the thread."""
         self._thread.start()
 
-    def stop(self) -> None:
-        """Ends the thread and lets go of the stream."""
+    def stop(self) -> tuple[Any, ...]:
+        """Ends the thread; returns what the caller has to let go of: the buffers, and the stream that writes to
+        them. A tuple is emptied from its end, so the stream goes first."""
         self._stopping.set()
         self._thread.join()
-        self._stream = None
-        self._memory.clear()
+        self._stream.set_emit_signals(False)
+        stream, self._stream = self._stream, None
+        return (self._memory, stream)
 
-    @property
-    def statistics(self) -> CameraStatistics:
-        """Counts since the start."""
-        return CameraStatistics(
-            self._good, self._incomplete, self._discarded, underruns=self._counted("n_underruns")
-        )
-
-    @property
-    def received_packets(self) -> int:
-        """Packets of the stream that reached this computer."""
-        return self._counted("n_received_packets")
-
-    def discard_until(self, host_time_ns: int) -> None:
-        """Drops every frame, waiting or on its way, whose first packet came before a host time."""
-        with self._arrived:
-            self._discarded += len(self._frames)
-            self._frames.clear()
-            self._not_before_ns = host_time_ns
-
-    def take(self, timeout_s: float) -> RawFrame | None:
-        """The oldest frame; None when there is none in time. Raises what went wrong in the thread."""
-        with self._arrived:
-            self._arrived.wait_for(lambda: self._frames or self._failure, timeout_s)
-            if self._failure is not None:
-                raise self._failure
-            return self._frames.popleft() if self._frames else None
-
-    def _counted(self, name: str) -> int:
+    def counted(self, name: str) -> int:
+        """One of the stream's own counters, such as "n_underruns"."""
         return int(self._stream.get_info_uint64_by_name(name))
 
     def _run(self) -> None:
@@ -110,12 +78,13 @@ class FrameGrabber:
             try:
                 frame = self._decode(buffer)
             except ToolkitError as error:
-                with self._arrived:
-                    self._failure = error
-                    self._arrived.notify_all()
+                self._frames.fail(error)
                 return
             self._stream.push_buffer(buffer)
-            self._hand_over(frame)
+            if frame is None:
+                self._frames.count_incomplete()
+            else:
+                self._frames.put(frame)
 
     def _decode(self, buffer: Any) -> RawFrame | None:
         """The buffer's frame, copied out of it; None for an incomplete one."""
@@ -125,32 +94,19 @@ class FrameGrabber:
         size = settings.format.size(settings.height, settings.width)
         pixels = unpack(self._memory[buffer][:size], settings.format, settings.height, settings.width)
         # Aravis stamps the arrival of the first packet on the wall clock, which may be set at any time.
-        wall_to_monotonic_ns = _wall_to_monotonic_ns()
+        host_time_ns = int(buffer.get_system_timestamp()) + _wall_to_monotonic_ns()
+        camera_time_ns = int(buffer.get_timestamp())
         return RawFrame(
             pixels=pixels,
             pixel_format=settings.format.name,
             frame_id=self._ids.unwrap(int(buffer.get_frame_id())),
-            camera_time_ns=int(buffer.get_timestamp()),
-            host_time_ns=int(buffer.get_system_timestamp()) + wall_to_monotonic_ns,
+            camera_time_ns=camera_time_ns,
+            host_time_ns=host_time_ns,
             exposure_us=settings.exposure_us,
             gain_db=settings.gain_db,
             missing_packets=0,
+            clock_epoch=self._epochs.of(camera_time_ns, host_time_ns),
         )
-
-    def _hand_over(self, frame: RawFrame | None) -> None:
-        with self._arrived:
-            if frame is None:
-                self._incomplete += 1
-                return
-            self._good += 1
-            if frame.host_time_ns < self._not_before_ns:
-                self._discarded += 1
-                return
-            if len(self._frames) == _QUEUE:
-                self._frames.popleft()
-                self._discarded += 1
-            self._frames.append(frame)
-            self._arrived.notify_all()
 
 
 def _wall_to_monotonic_ns() -> int:

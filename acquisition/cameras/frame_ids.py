@@ -14,12 +14,16 @@ class FrameIds:
 
     def __init__(self) -> None:
         self._last: int | None = None
-        self._unwrapped = 0
+        self._unwrapped: int | None = None
+
+    def resume(self) -> None:
+        """The camera counts anew; its first id will follow the last one so far."""
+        self._last = None
 
     def unwrap(self, block_id: int) -> int:
-        """The id, continued; the first one as it is."""
-        if self._last is None:
-            self._unwrapped = block_id
+        """The id, continued; the very first one as it is."""
+        if self._last is None or self._unwrapped is None:
+            self._unwrapped = block_id if self._unwrapped is None else self._unwrapped + 1
         else:
             step = block_id - self._last
             if max(block_id, self._last) <= _BLOCK_IDS:

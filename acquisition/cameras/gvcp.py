@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from dataset.errors import DeviceError
 
 PORT = 3956
+_IP_MTU = 14  # linux/in.h; not in Python's socket module
 _READREG, _READREG_ACK = 0x0080, 0x0081
 _KEY, _ACKNOWLEDGE = 0x42, 0x01
 _CONTROL_PRIVILEGE = 0x0A00
@@ -68,6 +69,13 @@ def probe(address: str) -> Presence:
         f"no camera answers at {address} (UDP port {PORT}); check the address (arv-tool-0.8 lists cameras), "
         "power and cable, that this computer is in the same subnet, and that the firewall lets UDP through"
     )
+
+
+def path_mtu(ip: str) -> int:
+    """Bytes of the largest packet that this computer's card on the way to an address lets through."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.connect((ip, PORT))
+        return link.getsockopt(socket.IPPROTO_IP, _IP_MTU)
 
 
 def wait_for_control(address: str) -> Presence:

@@ -128,7 +128,7 @@ def test_stop_and_start_again(simulated_camera: SimulatedCamera) -> None:
             camera.start()
             with pytest.raises(DeviceError, match="already started"):
                 camera.start()
-            with pytest.raises(DeviceError, match="runs free"):
+            with pytest.raises(DeviceError, match="does not wait for software triggers"):
                 camera.trigger()
             assert_true_to(camera.read(), simulated_camera)
             camera.stop()

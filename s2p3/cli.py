@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 
 from dataset.errors import ToolkitError
-from s2p3.commands import calibrate, capture, demo, devices, learn, sessions
+from s2p3.commands import calibrate, capture, console, demo, devices, learn, sessions
 
 Verb = Callable[..., Any]
 
@@ -38,6 +38,7 @@ VERBS: dict[str, Verb | Group] = {
             "sequence": capture.sequence,
         },
     ),
+    "console": console.console,
     "calibrate": Group(
         "Calibrate from recorded sessions; each result is added to calibration.json",
         {
@@ -56,6 +57,7 @@ VERBS: dict[str, Verb | Group] = {
             "validate": sessions.validate,
             "repair": sessions.repair,
             "split": sessions.split,
+            "view": console.view,
         },
     ),
     "decode": sessions.decode,

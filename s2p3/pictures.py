@@ -1,4 +1,4 @@
-"""Pictures of polarization: S0, DoLP, AoLP and normals as a person can look at them."""
+"""Pictures of normals, of objects over an image, and of raw mosaics in files."""
 
 from __future__ import annotations
 
@@ -12,35 +12,15 @@ from numpy.typing import NDArray
 
 from dataset.errors import ToolkitError
 from dataset.frames import Mosaic
+from dataset.pictures import Picture, angle, degree, intensity, nominal_camera_matrix, to_bytes
 from dataset.polarimetry import Raw, Stokes, decode
 from s2p3.physics import shape_priors
+from s2p3.rendering.rasterizer import Raster
 
-Picture = NDArray[np.uint8]
+CONTOUR_BGR = (80, 220, 255)
 
-_NOMINAL_FIELD_OF_VIEW = 0.7
-"""Focal length in image widths where no calibration is at hand (our choice: the paper's lens)."""
-
-
-def intensity(stokes: Stokes) -> Picture:
-    """(h, w) grey picture of S0, stretched to its brightest percent, gamma 2.2."""
-    bright = max(float(np.percentile(stokes.s0, 99)), 1e-6)
-    return _to_bytes(np.clip(stokes.s0 / bright, 0, 1) ** (1 / 2.2))
-
-
-def degree(stokes: Stokes, full_scale: float = 1.0) -> Picture:
-    """(h, w, 3) BGR picture of the DoLP, dark blue 0 to yellow `full_scale`."""
-    levels = _to_bytes(np.clip(stokes.dolp / full_scale, 0, 1))
-    return np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), np.uint8)
-
-
-def angle(stokes: Stokes) -> Picture:
-    """(h, w, 3) BGR picture of the AoLP: hue is the angle (0 and 180 degrees alike), brightness the DoLP's
-    root.
-    """
-    hue = np.mod(stokes.aolp * (180 / np.pi), 180).astype(np.uint8)
-    value = _to_bytes(np.sqrt(np.clip(stokes.dolp, 0, 1)))
-    picture = np.dstack([hue, np.full_like(hue, 220), value])
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_HSV2BGR), np.uint8)
+_SHADE_BGR = (255, 190, 60)
+_OPACITY = 0.45
 
 
 def normals(directions: NDArray[np.floating], mask: NDArray[np.bool_] | None = None) -> Picture:
@@ -48,10 +28,27 @@ def normals(directions: NDArray[np.floating], mask: NDArray[np.bool_] | None = N
     the camera blue.
     """
     shown = np.stack([-directions[..., 2], -directions[..., 1], directions[..., 0]], axis=-1)
-    picture = _to_bytes(0.5 + 0.5 * shown)
+    picture = to_bytes(0.5 + 0.5 * shown)
     if mask is not None:
         picture[~mask] = 0
     return picture
+
+
+def draw_object(picture: Picture, raster: Raster) -> None:
+    """Draws an object over a BGR picture (h, w, 3), in place: shaded as if lit from the camera, with its
+    outline.
+    """
+    inside = raster.mask
+    if not inside.any():
+        return
+    facing = np.clip(-raster.normals[..., 2], 0.15, 1.0)[..., None]
+    window = picture[raster.window]
+    mixed = (1 - _OPACITY) * window + _OPACITY * facing * np.array(_SHADE_BGR)
+    window[inside] = mixed[inside].astype(np.uint8)
+    whole = np.zeros(picture.shape[:2], np.uint8)
+    whole[raster.window] = inside
+    contours, _ = cv2.findContours(whole, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, contours, -1, CONTOUR_BGR, max(1, picture.shape[1] // 500), cv2.LINE_AA)
 
 
 def decode_picture(raw: Path, layout: Mosaic, out: Path, index: float) -> list[Path]:
@@ -88,12 +85,6 @@ def prior_normals(stokes: Stokes, K: NDArray[np.float64], index: float) -> NDArr
     return maps.reshape(3, 3, *stokes.shape).permute(0, 2, 3, 1).numpy()
 
 
-def nominal_camera_matrix(height: int, width: int) -> NDArray[np.float64]:
-    """(3, 3) pinhole matrix of a plausible lens, for pictures of uncalibrated frames."""
-    focal = _NOMINAL_FIELD_OF_VIEW * width
-    return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-
-
 def _read_mosaic(path: Path) -> Raw:
     """The pixels (H, W) of an image file, as they are stored."""
     try:
@@ -117,7 +108,3 @@ def _significant_bits(pixels: Raw) -> int:
     if pixels.dtype == np.uint8:
         return 8
     return next((bits for bits in (10, 12) if int(pixels.max()) < 1 << bits), 16)
-
-
-def _to_bytes(values: NDArray[np.floating]) -> Picture:
-    return np.rint(255 * values).astype(np.uint8)

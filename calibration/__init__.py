@@ -1,14 +1,17 @@
-"""From recorded sessions to intrinsics, hand-eye, time offset and object poses, each with its uncertainty."""
+"""From recorded sessions to everything a rig must know, each part with its uncertainty."""
 
+from calibration.apply import apply_calibration
 from calibration.board import BoardSpec
 from calibration.detection import Detection, detect, detect_in_mosaic
 from calibration.hand_eye import HandEyeResult, calibrate_hand_eye
 from calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
 from calibration.object_pose import ObjectPoseResult, register_points
+from calibration.polarizer import PolarizerResult, calibrate_polarizer
 from calibration.records import (
     HandEyeRecord,
     IntrinsicsRecord,
     ObjectPoseRecord,
+    PolarizerRecord,
     Source,
     TimeOffsetRecord,
     ToolTipRecord,
@@ -22,7 +25,8 @@ from calibration.sessions import (
     time_offset_from_session,
 )
 from calibration.time_offset import TimeOffsetResult, estimate_time_offset
-from calibration.touches import object_from_touches
+from calibration.tool_tip import ToolTipResult, calibrate_tool_tip
+from calibration.touches import KnownTip, object_from_touches, tool_tip_from_session
 
 __all__ = [
     "BoardSpec",
@@ -32,14 +36,21 @@ __all__ = [
     "HandEyeResult",
     "IntrinsicsRecord",
     "IntrinsicsResult",
+    "KnownTip",
     "ObjectPoseRecord",
     "ObjectPoseResult",
+    "PolarizerRecord",
+    "PolarizerResult",
     "Source",
     "TimeOffsetRecord",
     "TimeOffsetResult",
     "ToolTipRecord",
+    "ToolTipResult",
+    "apply_calibration",
     "calibrate_hand_eye",
     "calibrate_intrinsics",
+    "calibrate_polarizer",
+    "calibrate_tool_tip",
     "camera_poses",
     "detect",
     "detect_in_mosaic",
@@ -50,4 +61,5 @@ __all__ = [
     "object_from_touches",
     "register_points",
     "time_offset_from_session",
+    "tool_tip_from_session",
 ]

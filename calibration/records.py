@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,17 @@ from numpy.typing import NDArray
 from calibration.hand_eye import HandEyeResult
 from calibration.intrinsics import IntrinsicsResult
 from calibration.object_pose import ObjectPoseResult
+from calibration.polarizer import PolarizerResult
 from calibration.time_offset import TimeOffsetResult
+from calibration.tool_tip import ToolTipResult
 from dataset.errors import CalibrationError
 from dataset.intrinsics import Intrinsics
 from dataset.transforms import SE3
 
 Floats = NDArray[np.float64]
+
+EXTINCTION_MEASURABLE = 1e4
+"""Beyond it noise decides; the number is kept finite for the file."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +123,80 @@ class TimeOffsetRecord:
 
 @dataclass(frozen=True, eq=False)
 class ToolTipRecord:
-    """The touching tip in the tool's frame, (3,) metres; covariance (3, 3)."""
+    """The touching tip in the tool's frame, (3,) metres; covariance (3, 3); the arm's tool setting (6,) that
+    it holds for, empty where unknown."""
 
     tip_in_tcp: Floats
     covariance: Floats
+    rms_m: float
+    poses: int
+    slipped: int
+    tcp_offset: Floats
     sources: tuple[Source, ...]
+
+    @staticmethod
+    def of(result: ToolTipResult, tcp_offset: Floats | None, sources: tuple[Source, ...]) -> ToolTipRecord:
+        """The part of a result that is kept."""
+        return ToolTipRecord(
+            result.tip_in_tcp,
+            result.covariance,
+            result.rms_m,
+            int(result.used.sum()),
+            int((~result.used).sum()),
+            np.zeros(0) if tcp_offset is None else tcp_offset,
+            sources,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PolarizerRecord:
+    """What the pixels' polarizers are like, and the file beside calibration.json that holds each of them.
+
+    Attributes:
+        file, sha256: the file's name, and the digest of the analysis vectors in it.
+        extinction_ratio: (3,) its 5th, 50th and 95th percentile.
+        orientation_sigma_rad, gain_sigma: spread about the nominal.
+        cell_deg: (2, 2) mean orientation of the four kinds of pixels, degrees.
+        sigma: standard deviation of a component of an analysis vector; the ideal pixel's first is 0.5.
+        defective: share of pixels that are left out.
+        frames: how many it was estimated from.
+        warnings: what is odd, in words.
+        folder: where the file lies; not part of calibration.json.
+    """
+
+    file: str
+    sha256: str
+    extinction_ratio: Floats
+    orientation_sigma_rad: float
+    gain_sigma: float
+    cell_deg: Floats
+    sigma: float
+    defective: float
+    frames: int
+    warnings: tuple[str, ...]
+    sources: tuple[Source, ...]
+    folder: Path | None = field(default=None, metadata={"stored": False})
+
+    @staticmethod
+    def of(result: PolarizerResult, file: Path, digest: str, sources: tuple[Source, ...]) -> PolarizerRecord:
+        """The part of a result that is kept in calibration.json; the rest is in the file."""
+        response = result.response
+        alive = response.gain > 0
+        ratio = np.percentile(response.extinction_ratio[alive], [5, 50, 95])
+        return PolarizerRecord(
+            file.name,
+            digest,
+            np.minimum(ratio, EXTINCTION_MEASURABLE),
+            float(response.orientation_error[alive].std()),
+            float(response.gain[alive].std()),
+            result.cell_deg,
+            result.sigma,
+            result.defective,
+            len(result.states.level),
+            result.warnings,
+            sources,
+            file.parent,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from calibration import html, plots
 from calibration.board import BoardSpec
 from calibration.detection import intensity_image
 from calibration.hand_eye import HandEyeResult
 from calibration.intrinsics import IntrinsicsResult
-from calibration.object_pose import ObjectPoseResult
 from calibration.time_offset import TimeOffsetResult
 from dataset.frames import Mosaic
 from dataset.polarimetry import Raw
@@ -28,22 +27,11 @@ class ViewPicture:
     view: int
 
 
-@dataclass(frozen=True, eq=False)
-class TouchedObject:
-    """An object's result with what it was computed from: points (n, 3) in the base frame, and the mesh."""
-
-    result: ObjectPoseResult
-    points_base: NDArray[np.float64]
-    vertices: ArrayLike
-    faces: ArrayLike
-
-
 def calibration_report(
     spec: BoardSpec | None,
     intrinsics: IntrinsicsResult | None = None,
     hand_eye: HandEyeResult | None = None,
     time_offset: TimeOffsetResult | None = None,
-    objects: Mapping[str, TouchedObject] | None = None,
     pictures: Sequence[ViewPicture] = (),
     title: str = "Calibration report",
     subtitle: str = "",
@@ -52,7 +40,7 @@ def calibration_report(
 
     Args:
         spec: the board, where one was used.
-        intrinsics, hand_eye, time_offset, objects: results.
+        intrinsics, hand_eye, time_offset: results.
         pictures: of views of ``hand_eye`` where given, else of ``intrinsics``, to draw the corners on.
         title, subtitle: of the page.
     """
@@ -63,7 +51,6 @@ def calibration_report(
         sections.append(_hand_eye(hand_eye, pictures))
     if time_offset is not None:
         sections.append(_time_offset(time_offset))
-    sections += [_object(name, touched) for name, touched in (objects or {}).items()]
     return html.page(title, subtitle, sections, "" if spec is None else _describe(spec))
 
 
@@ -230,47 +217,6 @@ def _time_offset(result: TimeOffsetResult) -> str:
             html.Tile("Corner error", f"{result.rms_px:.2f} px", f"{result.rms_before_px:.1f} px without it"),
             html.Tile(
                 "Frames", str(int(result.used.sum())), f"{np.median(result.speed_px_s):.0f} px/s median"
-            ),
-        ),
-    )
-
-
-def _object(name: str, touched: TouchedObject) -> str:
-    result = touched.result
-    in_obj = result.T_base_obj.inverse().apply(touched.points_base)
-    sketch = plots.mesh_sketch(
-        np.asarray(touched.vertices, np.float64), np.asarray(touched.faces), in_obj, result.distance_m
-    )
-    count = len(result.distance_m)
-    sigma = np.sqrt(np.maximum(np.diagonal(result.covariance), 0))
-    angle = np.degrees(np.linalg.norm(sigma[3:]))
-    return html.section(
-        f"Object: {name}",
-        "Touched points on the mesh in its fitted pose; green lies within half a millimetre of the surface.",
-        *(html.note(f"The touched points do not determine the {words}.") for words in result.unobservable),
-        html.grid(
-            html.figure(sketch, "Touched points on the object.", 5),
-            html.figure(
-                plots.bars(
-                    np.abs(1e3 * result.distance_m),
-                    np.abs(result.distance_m) > 5e-4,
-                    [str(i) for i in range(count)],
-                    "mm",
-                    620,
-                ),
-                "Distance of every point from the surface.",
-                7,
-            ),
-        ),
-        html.tiles(
-            html.Tile("Fit", f"{1e3 * result.rms_m:.2f} mm", f"rms of {count} points"),
-            html.Tile("Position", f"± {1e3 * np.linalg.norm(sigma[:3]):.2f} mm", "one sigma, all axes"),
-            html.Tile("Rotation", f"± {angle:.2f}°", "one sigma, all axes", "warn" if angle > 3 else "plain"),
-            html.Tile(
-                "Next best pose",
-                f"{1e3 * result.runner_up_rms_m:.2f} mm" if np.isfinite(result.runner_up_rms_m) else "none",
-                "rms of the closest rival",
-                "warn" if result.runner_up_rms_m < 2 * result.rms_m else "good",
             ),
         ),
     )

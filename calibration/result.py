@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
@@ -18,17 +19,20 @@ from calibration.records import (
     HandEyeRecord,
     IntrinsicsRecord,
     ObjectPoseRecord,
+    PolarizerRecord,
     Source,
     TimeOffsetRecord,
     ToolTipRecord,
 )
+from calibration.response_file import read_response
 from dataset.errors import CalibrationError
+from dataset.polarizer_response import PolarizerResponse
 from dataset.transforms import SE3
 
 Floats = NDArray[np.float64]
 
 FORMAT = "s2p3-calibration"
-VERSION = "1.0"
+VERSION = "1.1"
 CONVENTIONS = (
     "T_a_b (4x4) maps points of frame b to frame a; metres, radians, seconds; intrinsics in pixels of the raw"
     " mosaic, pixel centres at integer coordinates, OpenCV's distortion order; the covariance of a"
@@ -46,6 +50,7 @@ class Calibration:
     hand_eye: HandEyeRecord | None = None
     time_offset: TimeOffsetRecord | None = None
     tool_tip: ToolTipRecord | None = None
+    polarizer: PolarizerRecord | None = None
     objects: Mapping[str, ObjectPoseRecord] = field(default_factory=dict)
 
     def merged(self, newer: Calibration) -> Calibration:
@@ -53,6 +58,15 @@ class Calibration:
         parts = {f.name: getattr(newer, f.name) for f in fields(self) if f.name != "objects"}
         changed = {name: part for name, part in parts.items() if part is not None}
         return replace(self, **changed, objects={**self.objects, **newer.objects})
+
+    @property
+    def polarizer_response(self) -> PolarizerResponse | None:
+        """Of every pixel, read from the file beside calibration.json; None where it was not calibrated.
+
+        Raises:
+            CalibrationError: the file is missing, or is not the one that was written.
+        """
+        return None if self.polarizer is None else read_response(self.polarizer)
 
     def require(self, *parts: str) -> None:
         """Raises when a part is missing.
@@ -80,7 +94,8 @@ class Calibration:
         return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
     def save(self, path: str | Path) -> None:
-        """Writes calibration.json, through a temporary file: a reader never sees half of it.
+        """Writes calibration.json, through a temporary file: a reader never sees half of it. The polarizers'
+        file, where there is one, comes along.
 
         Raises:
             CalibrationError: the file cannot be written.
@@ -88,6 +103,9 @@ class Calibration:
         path = Path(path)
         temporary = path.with_name(path.name + ".tmp")
         try:
+            folder = None if self.polarizer is None else self.polarizer.folder
+            if self.polarizer is not None and folder is not None and folder != path.parent:
+                shutil.copyfile(folder / self.polarizer.file, path.parent / self.polarizer.file)
             temporary.write_text(self.to_json(), encoding="utf-8")
             temporary.replace(path)
         except OSError as error:
@@ -136,7 +154,10 @@ class Calibration:
             raise CalibrationError(
                 f"{path}: cannot be read as a calibration; check the path, or run `s2p3 calibrate` first"
             ) from error
-        return Calibration.from_json(text, str(path))
+        found = Calibration.from_json(text, str(path))
+        if found.polarizer is None:
+            return found
+        return replace(found, polarizer=replace(found.polarizer, folder=path.parent))
 
 
 def _encode(value: Any) -> Any:
@@ -151,7 +172,8 @@ def _encode(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_encode(item) for item in value]
     if hasattr(value, "__dataclass_fields__"):
-        return {f.name: _encode(getattr(value, f.name)) for f in fields(value)}
+        stored = [f.name for f in fields(value) if f.metadata.get("stored", True)]
+        return {name: _encode(getattr(value, name)) for name in stored}
     return value
 
 
@@ -164,6 +186,8 @@ def _decode(kind: type[T], content: Any, where: str) -> T:
     values: dict[str, Any] = {}
     for f in fields(kind):  # type: ignore[arg-type]
         at = f"{where}: {f.name}"
+        if f.name not in content and (f.default is not MISSING or f.default_factory is not MISSING):
+            continue  # written by a version that did not know it yet
         try:
             values[f.name] = _decode_value(hints[f.name], content[f.name], at)
         except (KeyError, TypeError, ValueError) as error:

@@ -1,14 +1,17 @@
-"""Points touched with the arm's tip: from recorded sessions and text files to an object's pose."""
+"""What the arm's tip told: from recorded sessions and text files to touched points, pivots and poses."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.object_observability import Tip
 from calibration.object_pose import ObjectPoseResult, register_points
 from calibration.sessions import arm_trace, rest_pose
+from calibration.tool_tip import MIN_POSES, ToolTipResult, calibrate_tool_tip
 from dataset.errors import CalibrationError
 from dataset.rests import find_rests
 from dataset.session import Session
@@ -16,46 +19,82 @@ from dataset.transforms import SE3
 
 Floats = NDArray[np.float64]
 
+_PIVOT_STEP_RAD = np.radians(2.0)
+_SAME_TOOL_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTip:
+    """The tip in the tool's frame.
+
+    Attributes:
+        in_tcp: (3,) metres.
+        covariance: (3, 3).
+        ball_m: radius of a ball at its end, whose centre `in_tcp` is then; 0 for a point.
+        tcp_offset: (6,) the arm's tool setting it holds for; None where that is not known.
+    """
+
+    in_tcp: Floats
+    covariance: Floats
+    ball_m: float = 0.0
+    tcp_offset: Floats | None = None
+
+    @staticmethod
+    def exactly(in_tcp: ArrayLike, ball_m: float = 0.0) -> KnownTip:
+        """A tip that is taken at its word."""
+        return KnownTip(np.asarray(in_tcp, np.float64), np.zeros((3, 3)), ball_m)
+
+
+@dataclass(frozen=True, eq=False)
+class Touches:
+    """Touched points: (n, 3) in the base frame, metres, and what touched."""
+
+    points: Floats
+    tip: Tip
+
 
 def object_from_touches(
     touches: Session | str | Path,
     vertices: ArrayLike,
     faces: ArrayLike,
-    tip_in_tcp: ArrayLike = (0.0, 0.0, 0.0),
+    tip: KnownTip,
     init: SE3 | None = None,
     symmetry_axis: ArrayLike | None = None,
 ) -> ObjectPoseResult:
     """The pose of an object in the base frame from touched points.
 
     Args:
-        touches: a session of kind "tool_tip" (the arm at rest with the tip on the surface, see
-            `touched_points`), or a text file of points: x y z a line, metres in the base frame, '#' starts a
-            comment.
+        touches, tip: as in `touched_points` or `points_of_file`.
         vertices, faces: (V, 3) metres, (F, 3): the object.
-        tip_in_tcp: (3,) the tip in the tool's frame, metres; only used with a session.
         init, symmetry_axis: as in `register_points`.
 
     Raises:
         CalibrationError: as `register_points`, or no readable points.
     """
     if isinstance(touches, Session):
-        points = touched_points(touches, tip_in_tcp)
+        found = touched_points(touches, tip)
     else:
-        points = read_points(touches)
-    return register_points(points, vertices, faces, init, symmetry_axis)
+        found = Touches(read_points(touches), Tip(tip.ball_m))
+    return register_points(found.points, vertices, faces, init, symmetry_axis, found.tip)
 
 
-def touched_points(session: Session, tip_in_tcp: ArrayLike) -> Floats:
-    """(n, 3) where the tool's tip was, in the base frame, at each rest of a hand-guided session, or in each
-    frame of a session that has frames; the arm at rest.
+def touched_points(session: Session, tip: KnownTip) -> Touches:
+    """Where the tip was at each rest of a hand-guided session, or in each frame of a session that has
+    frames; the arm at rest.
+
+    Args:
+        session: kind "touches".
+        tip: that touched.
 
     Raises:
-        CalibrationError: no robot trace, or the arm moved at a touch.
+        CalibrationError: no robot trace, the arm moved at a touch, no touches at all, or the arm's tool
+            setting is not the one that the tip was calibrated with.
     """
+    _require_same_tool(session, tip)
     times, trace = arm_trace(session)
-    points: list[Floats] = []
+    poses: list[SE3] = []
     if len(session) == 0 and session.robot is not None:
-        points = [rest.T_base_tcp.apply(tip_in_tcp) for rest in find_rests(session.robot)]
+        poses = [rest.T_base_tcp for rest in find_rests(session.robot)]
     for index in range(len(session)):
         pose = rest_pose(times, trace, int(session.mid_exposure_host_ns[index]))
         if pose is None:
@@ -63,8 +102,58 @@ def touched_points(session: Session, tip_in_tcp: ArrayLike) -> Floats:
                 f"{session.path}: the arm was moving at touch {index}; hold the tip still for half a second"
                 " a touch"
             )
-        points.append(pose.apply(np.asarray(tip_in_tcp, np.float64)))
-    return np.array(points).reshape(-1, 3)
+        poses.append(pose)
+    if not poses:
+        raise CalibrationError(
+            f"{session.path}: the arm was never held still, so nothing was touched; rest for a second on"
+            " every point"
+        )
+    at = SE3.stack(poses)
+    return Touches(at.apply(tip.in_tcp), Tip(tip.ball_m, tip.covariance, at.rotation))
+
+
+def tool_tip_from_session(session: Session) -> ToolTipResult:
+    """The tip from a session in which it stayed on one point while the arm was tilted.
+
+    The rests of the arm count; where it was swung without a rest, poses two degrees apart.
+
+    Raises:
+        CalibrationError: touched points instead of a pivot, no robot trace, or as `calibrate_tool_tip`.
+    """
+    if session.kind == "touches":
+        raise CalibrationError(
+            f"{session.path} holds points touched on an object; record the tip on one fixed point with"
+            " `s2p3 capture tool-tip`"
+        )
+    _, trace = arm_trace(session)
+    assert session.robot is not None
+    rests = [rest.T_base_tcp for rest in find_rests(session.robot)]
+    return calibrate_tool_tip(SE3.stack(rests) if len(rests) >= MIN_POSES else _thinned(trace))
+
+
+def _thinned(trace: SE3) -> SE3:
+    """Poses of a trace that lie two degrees apart at least."""
+    kept = [0]
+    for index in range(1, len(trace)):
+        cosine = (np.vdot(trace.rotation[index], trace.rotation[kept[-1]]) - 1) / 2
+        if cosine < np.cos(_PIVOT_STEP_RAD):
+            kept.append(index)
+    return trace[np.array(kept)]
+
+
+def _require_same_tool(session: Session, tip: KnownTip) -> None:
+    if tip.tcp_offset is None or session.tcp_offset is None:
+        return
+    if np.abs(tip.tcp_offset - session.tcp_offset).max() > _SAME_TOOL_M:
+        raise CalibrationError(
+            f"{session.path}: recorded with another tool setting of the arm ({_six(session.tcp_offset)}) than"
+            f" the tip was calibrated with ({_six(tip.tcp_offset)}); set [robot] tcp_offset alike and record"
+            " again"
+        )
+
+
+def _six(pose: Floats) -> str:
+    return " ".join(f"{value:g}" for value in pose)
 
 
 def read_points(path: str | Path) -> Floats:

@@ -29,7 +29,7 @@ def calibration(world, tmp_path):
             world.T_tcp_cam, world.T_base_board, np.eye(12), 0.2, 0.1, 0.01, 3e-5, 5e-5, 22, source
         ),
         time_offset=TimeOffsetRecord(0.031, 2e-5, 0.2, source),
-        tool_tip=ToolTipRecord(np.array([0, 0, 0.12]), np.eye(3), ()),
+        tool_tip=ToolTipRecord(np.array([0, 0, 0.12]), np.eye(3), 1e-4, 12, 1, np.zeros(6), ()),
         objects={"cup": ObjectPoseRecord(SE3.identity(), np.eye(6), 1e-4, 24, ("its turn",), source)},
     )
 

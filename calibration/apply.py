@@ -1,0 +1,49 @@
+"""Writing a calibration into a session, which from then on is self-contained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibration.result import Calibration
+from calibration.sessions import camera_poses
+from dataset.errors import CalibrationError
+from dataset.session import Session, write_calibration, write_poses
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What a session got: intrinsics, the polarizers' response, a pose for so many of its frames."""
+
+    intrinsics: bool
+    polarizer: bool
+    poses: int
+    frames: int
+
+
+def apply_calibration(session: Path, calibration: Calibration) -> Applied:
+    """Writes /calibration (the text with its sha256, K and distortion, the polarizers' response) and, where
+    hand-eye and the arm's trace are known, the camera's pose in every frame. What an earlier calibration left
+    is replaced; objects annotated with it lose their poses: annotate again.
+
+    Raises:
+        CalibrationError: nothing in the calibration concerns a camera.
+        SessionError: the session cannot be edited, or is of another image size.
+    """
+    if calibration.intrinsics is None and calibration.polarizer is None:
+        raise CalibrationError(
+            "calibration: neither intrinsics nor polarizers are calibrated; there is nothing to apply to"
+            f" {session} yet"
+        )
+    intrinsics = None if calibration.intrinsics is None else calibration.intrinsics.intrinsics
+    response = calibration.polarizer_response
+    write_calibration(session, calibration.to_json(), intrinsics, response)
+    with Session.open(session) as opened:
+        frames = len(opened)
+        has_arm = opened.robot is not None and len(opened.robot) > 1
+        if calibration.hand_eye is None or not has_arm or frames == 0:
+            return Applied(intrinsics is not None, response is not None, 0, frames)
+        cameras = camera_poses(opened, calibration)
+    write_poses(session, cameras.T_base_cam, cameras.sigma_m, cameras.sigma_rad, {})
+    known = int(cameras.T_base_cam.finite.sum())
+    return Applied(intrinsics is not None, response is not None, known, frames)

@@ -6,8 +6,8 @@ the devices.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from itertools import cycle
 from pathlib import Path
 from typing import Literal
@@ -16,13 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acquisition.camera import Camera
-from acquisition.planning import CarriedCamera, plan_path, plan_stills
-from acquisition.recorder import NO_CAMERA, OnProgress, Progress, record_stills, record_stream, record_touches
+from acquisition.clearance import CarriedCamera
+from acquisition.planning import plan_path, plan_stills
+from acquisition.recorder import (
+    NO_CAMERA,
+    OnProgress,
+    Progress,
+    record_stills,
+    record_stream,
+    record_touches,
+    record_turns,
+)
 from acquisition.rig import Rig, open_camera, open_pose_source, open_robot
 from acquisition.robot import Robot
 from acquisition.trajectories import hand_eye_views, hemisphere_path
 from dataset.frames import CameraInfo
 from dataset.intrinsics import Intrinsics
+from dataset.schema import Kind
 from dataset.session import SessionWriter
 from dataset.transforms import SE3
 
@@ -79,10 +89,31 @@ def capture_board_motion(
 
 
 def capture_sequence(
-    rig: Rig, out: Path, *, seconds: float, on_progress: OnProgress = lambda progress: None
+    rig: Rig,
+    out: Path,
+    *,
+    seconds: float,
+    append: bool = False,
+    on_progress: OnProgress = lambda progress: None,
 ) -> Progress:
-    """The object filmed from the hemisphere above it, sweep after sweep at changing distance."""
-    with _devices(rig) as (camera, robot), _writer(out, "sequence", camera.info, rig) as writer:
+    """The object filmed from the hemisphere above it, sweep after sweep at changing distance.
+
+    Args:
+        out: session file to write.
+        seconds: how long to film.
+        append: whether `out` is a sequence that was interrupted and repaired, and shall go on.
+
+    Raises:
+        SessionError: `out` exists, or with `append` cannot go on; says why.
+        ToolkitError: no view is reachable.
+        DeviceError: a device does not answer or stopped.
+    """
+    with ExitStack() as stack:
+        camera, robot = stack.enter_context(_devices(rig))
+        if append:
+            writer = stack.enter_context(SessionWriter.append(out, "sequence", camera.info))
+        else:
+            writer = stack.enter_context(_writer(out, "sequence", camera.info, rig))
         centre = np.array(rig.frames.object_centre_guess)
         carried = _carried(rig, robot)
         q = robot.sample().q
@@ -102,8 +133,35 @@ def capture_sequence(
 def capture_touches(
     rig: Rig, out: Path, *, count: int, on_progress: OnProgress = lambda progress: None
 ) -> Progress:
-    """Points touched with the measuring tip while a hand guides the arm; the toolkit only reads it."""
-    with open_pose_source(rig) as source, _writer(out, "tool_tip", NO_CAMERA, rig) as writer:
+    """Points touched on the object with the measuring tip while a hand guides the arm; the toolkit only reads
+    it."""
+    return _guided(rig, out, "touches", count, on_progress)
+
+
+def capture_tool_tip(
+    rig: Rig, out: Path, *, count: int, on_progress: OnProgress = lambda progress: None
+) -> Progress:
+    """The tip kept in one point while a hand tilts the tool, `count` times held still."""
+    return _guided(rig, out, "tool_tip", count, on_progress)
+
+
+def capture_polarizer(
+    rig: Rig,
+    out: Path,
+    turns: Iterable[float],
+    *,
+    frames: int = 1,
+    on_progress: OnProgress = lambda progress: None,
+) -> Progress:
+    """An even lamp behind a linear polarizer that somebody turns; `turns` as in `record_turns`."""
+    with open_camera(rig) as camera, _writer(out, "polarizer", camera.info, rig) as writer:
+        return record_turns(camera, writer, turns, frames=frames, on_progress=on_progress)
+
+
+def _guided(
+    rig: Rig, out: Path, kind: Literal["touches", "tool_tip"], count: int, on_progress: OnProgress
+) -> Progress:
+    with open_pose_source(rig) as source, _writer(out, kind, NO_CAMERA, rig) as writer:
         touches = record_touches(source, writer, count, on_progress=on_progress)
     return Progress(len(touches), 0, 1.0)
 
@@ -114,9 +172,7 @@ def _devices(rig: Rig) -> Iterator[tuple[Camera, Robot]]:
         yield camera, robot
 
 
-def _writer(
-    out: Path, kind: Literal["intrinsics", "hand_eye", "tool_tip", "sequence"], camera: CameraInfo, rig: Rig
-) -> SessionWriter:
+def _writer(out: Path, kind: Kind, camera: CameraInfo, rig: Rig) -> SessionWriter:
     return SessionWriter(out, kind, camera, rig_toml=rig.to_toml())
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,6 +39,7 @@ __all__ = [
     "record_stills",
     "record_stream",
     "record_touches",
+    "record_turns",
 ]
 
 NO_CAMERA = CameraInfo("none", "none", "", "", "Mono8", "mono", width=2, height=2, bits=8, packet_size=0)
@@ -118,6 +119,38 @@ def record_stream(
     return recorder.progress
 
 
+def record_turns(
+    camera: Camera,
+    writer: SessionWriter,
+    turns: Iterable[float],
+    *,
+    frames: int = 1,
+    on_progress: OnProgress = ignore,
+) -> Progress:
+    """Frames of a lamp behind a polarizer that is turned in between, for the calibration of the polarizers.
+
+    Args:
+        camera: opened, not started.
+        writer: of a session of kind "polarizer", with `camera.info`.
+        turns: yields the polarizer's angle (radians, NaN where nobody reads it) as soon as it stands there.
+        frames: to take at each.
+        on_progress: called after every angle.
+
+    Raises:
+        DeviceError: the camera stopped, or a triggered frame did not arrive twice in a row.
+        SessionError: the disk refuses a frame.
+    """
+    ledger = FrameLedger(writer)
+    warnings: list[str] = []
+    with recording(camera, None, writer, "software", warnings):
+        for angle in turns:
+            for _again in range(frames):
+                ledger.store(_triggered_frame(camera, ledger))
+                writer.add_polarizer_angle(angle)
+            on_progress(Progress(ledger.stored, ledger.dropped, None))
+    return Progress(ledger.stored, ledger.dropped, None, tuple(warnings))
+
+
 def record_touches(
     source: PoseSource,
     writer: SessionWriter,
@@ -126,14 +159,15 @@ def record_touches(
     finder: RestFinder | None = None,
     on_progress: OnProgress = ignore,
 ) -> list[Rest]:
-    """Points touched with the measuring tip, the arm being guided by hand: only reads the arm.
+    """Points touched with the measuring tip, or tilts about one point, the arm being guided by hand: only
+    reads the arm.
 
     A point is taken whenever the arm is held still for a moment, elsewhere than before. The session holds the
     trace, in which `dataset.rests.find_rests` finds the same points again.
 
     Args:
         source: connected, without a running trace.
-        writer: of a session of kind "tool_tip", with `NO_CAMERA`.
+        writer: of a session of kind "touches" or "tool_tip", with `NO_CAMERA`.
         count: points to take.
         finder: when the arm counts as still.
         on_progress: called at every point.

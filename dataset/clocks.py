@@ -37,7 +37,8 @@ _ROUNDS = 4
 
 FEWEST_SAMPLES = 5
 """Fewer arrivals than this cannot show a rate; the device's is then taken as the host's."""
-_SIGMA_OF_FEW_NS = 5e6  # how late an arrival may be on a busy host; our choice
+ARRIVAL_SIGMA_NS = 5e6
+"""How late a single arrival may be on a busy host (our choice)."""
 
 _JUMP_NS = 200_000_000  # our choice: what a busy host explains less well than a clock that was set
 _JUMP_NEIGHBOURS = 30
@@ -159,7 +160,7 @@ def _fit_run(device: Times, host: Times) -> tuple[list[int], list[ClockFit]]:
     lateness = ((host - host[0]) - (device - device[0])).astype(np.float64)  # ns; small, so exact as a float
     offset_ns = int(host[0]) - int(device[0])
     if len(device) < FEWEST_SAMPLES or span_ns == 0:
-        sigma = max(_SIGMA_OF_FEW_NS, float(np.ptp(lateness)))
+        sigma = max(ARRIVAL_SIGMA_NS, float(np.ptp(lateness)))
         return [0], [ClockFit(float(offset_ns + lateness.min()), 1.0, sigma)]
     span_ratio = float(host[-1] - host[0]) / span_ns
     if not 1 / _LARGEST_SPAN_RATIO < span_ratio < _LARGEST_SPAN_RATIO:

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from dataset.clocks import DeviceClock, fit_clock
+from dataset.clocks import ARRIVAL_SIGMA_NS, DeviceClock, fit_clock
 from dataset.errors import ToolkitError
 from dataset.frames import ClockFit
 from dataset.schema import declaration
@@ -22,7 +22,8 @@ Times = NDArray[np.int64]
 def fit_stored(file: h5py.File) -> Clocks:
     """Fits both clocks to all arrivals in an open file, segment by segment, and stores them there.
 
-    A clock that no line describes stays as it was, and is None in what is returned.
+    A clock that no line describes stays as it was, and is None in what is returned. Where the camera has no
+    clock of its own its times are arrivals, each as late as it happened to be.
     """
     found = {}
     for name, first in (("camera", "first_frame"), ("robot", "first_sample")):
@@ -30,6 +31,8 @@ def fit_stored(file: h5py.File) -> Clocks:
         starts = [int(row) for row in file["segments"][first]] if "segments" in file else [0]
         with suppress(ToolkitError):
             found[name] = fit_clock(device, host, starts)
+            if name == "camera" and file["camera"].attrs.get("clock") == "host":
+                found[name] = DeviceClock((0,), (ClockFit(0.0, 1.0, ARRIVAL_SIGMA_NS),))
             store(file, name, found[name])
     return Clocks(found.get("camera"), found.get("robot"))
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dataset.errors import ToolkitError
 from s2p3.commands.arguments import at_least
 from s2p3.commands.output import counting, say
 
@@ -65,7 +68,24 @@ def board_motion(*, rig: Path, out: Path, seconds: float = 14.0) -> None:
     say(summary(out, done))
 
 
-def tool_tip(*, rig: Path, out: Path, points: int = 24) -> None:
+def tool_tip(*, rig: Path, out: Path, poses: int = 16) -> None:
+    """Record the arm while you tilt it by hand about its tip, which stays in one point: a punched hole.
+
+    Args:
+        rig: rig.toml with the arm's address and tool offset.
+        out: session file to write; never overwritten.
+        poses: how many; tilt by 20-30 degrees to all sides and turn, hold still for a second at each.
+    """
+    from acquisition.capture import capture_tool_tip
+    from acquisition.rig import Rig
+
+    at_least(6, poses=poses)
+    with recording("poses") as report:
+        done = capture_tool_tip(Rig.load(rig), out, count=poses, on_progress=report)
+    say(f"{out}: {done.frames} poses about the tip")
+
+
+def touches(*, rig: Path, out: Path, points: int = 24) -> None:
     """Record the arm while you guide its tip by hand from point to point on the object.
 
     Args:
@@ -82,20 +102,62 @@ def tool_tip(*, rig: Path, out: Path, points: int = 24) -> None:
     say(f"{out}: {done.frames} points touched")
 
 
-def sequence(*, rig: Path, out: Path, seconds: float = 60.0) -> None:
+def polarizer(
+    *,
+    rig: Path,
+    out: Path,
+    angles: int = 36,
+    frames: int = 2,
+    step_deg: float = 5.0,
+    unread: bool = False,
+) -> None:
+    """Take stills of an even lamp behind a linear polarizer, which you turn when asked.
+
+    Args:
+        rig: rig.toml with the camera's address.
+        out: session file to write; never overwritten.
+        angles: how many; together they should cover 180 degrees evenly.
+        frames: stills at each angle: more of them, less noise.
+        step_deg: from one angle to the next, counter-clockwise as the image shows it.
+        unread: the polarizer has no dial: turn it by about a step, the pictures tell the angle.
+    """
+    from acquisition.capture import capture_polarizer
+    from acquisition.rig import Rig
+
+    at_least(6, angles=angles)
+    at_least(1, frames=frames)
+    done = capture_polarizer(Rig.load(rig), out, _asked_turns(angles, step_deg, unread), frames=frames)
+    say(summary(out, done))
+
+
+def _asked_turns(count: int, step_deg: float, unread: bool) -> Iterator[float]:
+    """Asks for one angle after the other; radians, NaN where nobody reads them."""
+    for index in range(count):
+        angle = index * step_deg
+        where = f"on by about {step_deg:g} degrees" if unread else f"to {angle:g} degrees"
+        say(f"[{index + 1}/{count}] turn the polarizer {where}, then press Enter")
+        if not sys.stdin.readline():
+            raise ToolkitError(
+                f"the input ended at angle {index + 1} of {count}; press Enter at each, or pipe in as many"
+            )
+        yield float("nan") if unread else math.radians(angle)
+
+
+def sequence(*, rig: Path, out: Path, seconds: float = 60.0, append: bool = False) -> None:
     """Film the object from all around while the arm moves.
 
     Args:
         rig: rig.toml with the devices' addresses.
         out: session file to write; never overwritten.
         seconds: how long to film.
+        append: go on with OUT, a sequence that was interrupted and has been repaired.
     """
     from acquisition.capture import capture_sequence
     from acquisition.rig import Rig
 
     at_least(1, seconds=seconds)
     with recording("frames") as report:
-        done = capture_sequence(Rig.load(rig), out, seconds=seconds, on_progress=report)
+        done = capture_sequence(Rig.load(rig), out, seconds=seconds, append=append, on_progress=report)
     say(summary(out, done))
 
 
@@ -112,5 +174,6 @@ def recording(label: str) -> Iterator[OnProgress]:
 
 
 def summary(out: Path, done: Progress) -> str:
-    """One line about a recording."""
-    return f"{out}: {done.frames} frames stored, {done.dropped} dropped and in the ledger"
+    """What a recording holds, and a line for each thing about it that is doubtful."""
+    lines = [f"{out}: {done.frames} frames stored, {done.dropped} dropped and in the ledger"]
+    return "\n".join([*lines, *(f"warning: {warning}" for warning in done.warnings)])

@@ -1,7 +1,6 @@
 """Which of the wished-for camera poses an arm reaches, with which joint angles, and in which order.
 
-The arm is a nominal UR5e on a table. It is clear of the table and of itself when thick points along it are;
-the shapes are our choice, on the cautious side. Anything else that stands in the room is not known here.
+The arm is a nominal UR5e; a real one is off by millimetres, which `acquisition.clearance` leaves room for.
 """
 
 from __future__ import annotations
@@ -12,7 +11,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acquisition.kinematics import JOINT_LIMIT, inverse_all, link_transforms, unwrap_near
+from acquisition.clearance import CarriedCamera, is_clear, sweep_clear
+from acquisition.kinematics import JOINT_LIMIT, inverse_all, unwrap_near
 from dataset.errors import ToolkitError
 from dataset.transforms import SE3
 
@@ -22,38 +22,9 @@ Indices = NDArray[np.intp]
 VIA = -1
 """Stands in a plan's index for a waypoint that is no view."""
 
-_LINK_RADIUS = 0.06  # m
-_UPPER_ARM_OFFSET, _FOREARM_OFFSET = 0.138, 0.007  # m, of the tubes beside the Denavit-Hartenberg skeleton
-_COLUMN_HEIGHT, _COLUMN_RADIUS = 0.24, 0.08  # m, of the base and shoulder
-_SWEEP_STEP_RAD = 0.08
 _NEIGHBOURS_TRIED = 24
+_SMALLEST_GAIN_RAD = 1e-3
 _ROLLS = tuple(np.deg2rad(np.arange(-180, 180, 15)))
-
-
-@dataclass(frozen=True)
-class CarriedCamera:
-    """The camera on the flange, and how much room it needs.
-
-    Attributes:
-        T_flange_tcp: the active tool.
-        T_tcp_cam: rough hand-eye transform.
-        radius: metres of room around the optical axis.
-        length_behind, length_ahead: metres of housing behind, and of lens ahead of, the camera's centre.
-        table_z: height of the table in the base frame, metres.
-        table_gap: metres that everything stays above the table.
-    """
-
-    T_flange_tcp: SE3
-    T_tcp_cam: SE3
-    radius: float = 0.04
-    length_behind: float = 0.05
-    length_ahead: float = 0.02
-    table_z: float = 0.0
-    table_gap: float = 0.03
-
-    def T_base_flange(self, T_base_cam: SE3) -> SE3:
-        """Where the flange is when the camera is there."""
-        return T_base_cam @ (self.T_flange_tcp @ self.T_tcp_cam).inverse()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,34 +40,6 @@ class JointPlan:
     q: Floats
     index: Indices
     unreachable: Indices
-
-
-def is_clear(q: ArrayLike, camera: CarriedCamera) -> NDArray[np.bool_]:
-    """(...) bool: whether joint angles (..., 6) keep arm and camera clear of the table and the arm."""
-    links = link_transforms(q)
-    origins, axes = links[..., :3, 3], links[..., :3, 2]
-    mount = (camera.T_flange_tcp @ camera.T_tcp_cam).as_matrix()
-    along = np.array([-camera.length_behind, 0.0, camera.length_ahead])
-    housing = mount[:3, 3] + along[:, None] * mount[:3, 2]
-    tool = np.einsum("...ij,kj->...ki", links[..., 6, :3, :3], housing) + origins[..., 6:7, :]
-    shoulder = origins[..., 1, :] + _UPPER_ARM_OFFSET * axes[..., 1, :]
-    elbow = origins[..., 2, :] + _UPPER_ARM_OFFSET * axes[..., 1, :]
-    elbow_inner = origins[..., 2, :] + _FOREARM_OFFSET * axes[..., 1, :]
-    wrist = origins[..., 3, :] + _FOREARM_OFFSET * axes[..., 1, :]
-    floor = camera.table_z + camera.table_gap
-    joints = np.concatenate([origins[..., 2:, :], elbow[..., None, :]], axis=-2)
-    high = joints[..., 2].min(axis=-1) > floor + _LINK_RADIUS
-    high &= tool[..., 2].min(axis=-1) > floor + camera.radius
-    top = np.array([0.0, 0.0, _COLUMN_HEIGHT])
-    hand = np.concatenate([origins[..., 5:, :], tool], axis=-2)
-    room = np.array([_LINK_RADIUS, _LINK_RADIUS, camera.radius, camera.radius, camera.radius])
-    base = np.broadcast_to(np.zeros(3), top.shape)
-    free = _distance(hand, base, top) > room + _COLUMN_RADIUS
-    free &= _distance(hand, shoulder, elbow) > room + _LINK_RADIUS
-    forearm = _distance(tool, elbow_inner, wrist) > camera.radius + _LINK_RADIUS
-    arm = np.stack([elbow, wrist], axis=-2)
-    column = _distance(arm, base, top) > _LINK_RADIUS + _COLUMN_RADIUS
-    return np.asarray(high & free.all(axis=-1) & forearm.all(axis=-1) & column.all(axis=-1))
 
 
 def configurations(T_base_cam: SE3, camera: CarriedCamera, rolls: ArrayLike = (0.0,)) -> Floats:
@@ -125,6 +68,7 @@ def plan_stills(
     camera: CarriedCamera,
     q_start: ArrayLike,
     count: int | None = None,
+    worth: ArrayLike = 1.0,
 ) -> JointPlan:
     """Joint angles for single pictures, each a short and clear straight joint motion from the one before.
 
@@ -132,10 +76,12 @@ def plan_stills(
         T_base_cam: a batch of M views, in any order.
         camera: how it is carried.
         q_start: (6,) where the arm is.
-        count: the most views to keep, those that differ most in rotation. All by default.
+        count: the most views to keep, those whose rotations differ most usefully. All by default.
+        worth: (M,) of each view, such as how much it shows of a board; weighs in where `count` chooses.
 
     Returns:
-        The plan, ordered greedily by joint distance; views that only a collision would lead to are left out.
+        The plan, in an order that keeps the motions short; views that only a collision would lead to are
+        left out.
 
     Raises:
         ToolkitError: nothing is reachable.
@@ -143,25 +89,63 @@ def plan_stills(
     candidates = configurations(T_base_cam, camera)[:, 0]
     reachable = np.flatnonzero(np.isfinite(candidates).any(axis=(1, 2)))
     if count is not None and len(reachable) > count:
-        reachable = reachable[_most_diverse(T_base_cam[reachable], count)]
-    here = np.asarray(q_start, dtype=np.float64)
-    left = set(reachable.tolist())
-    q, index = [], []
+        worths = np.broadcast_to(np.asarray(worth, dtype=np.float64), len(T_base_cam))
+        reachable = reachable[most_diverse(T_base_cam[reachable], count, worths[reachable])]
+    start = np.asarray(q_start, dtype=np.float64)
+    q, index = _nearest_next(candidates, reachable, start, camera)
+    order = shorten(start, q, camera)
+    return _plan([q[i] for i in order], [index[i] for i in order], len(T_base_cam))
+
+
+def _nearest_next(
+    candidates: Floats, views: Indices, start: Floats, camera: CarriedCamera
+) -> tuple[list[Floats], list[int]]:
+    """Goes from each configuration to the nearest of any view that is left and can be reached from there."""
+    here = start
+    left = set(views.tolist())
+    q: list[Floats] = []
+    index: list[int] = []
     while left:
-        views = np.array(sorted(left))
-        near = unwrap_near(candidates[views], here, JOINT_LIMIT)
+        rest = np.array(sorted(left))
+        near = unwrap_near(candidates[rest], here, JOINT_LIMIT)
         distance = np.abs(near - here).max(axis=-1)
         order = np.argsort(np.where(np.isnan(distance), np.inf, distance), axis=None)[:_NEIGHBOURS_TRIED]
         for view, solution in zip(*np.unravel_index(order, distance.shape), strict=True):
-            if np.isfinite(distance[view, solution]) and _sweep_clear(here, near[view, solution], camera):
+            if np.isfinite(distance[view, solution]) and sweep_clear(here, near[view, solution], camera):
                 here = near[view, solution]
                 q.append(here)
-                index.append(int(views[view]))
+                index.append(int(rest[view]))
                 left.remove(index[-1])
                 break
         else:
             break
-    return _plan(q, index, len(T_base_cam))
+    return q, index
+
+
+def shorten(start: Floats, q: list[Floats], camera: CarriedCamera) -> list[int]:
+    """A shorter order of configurations (6,) after `start`: 2-opt, turning round a part of the way as long
+    as that makes it shorter and the new motions are clear. The length is that of the fastest joint."""
+    points = np.array([start, *q])
+    length = np.abs(points[:, None] - points[None]).max(axis=-1)
+    tour = list(range(len(points)))
+    improved = True
+    while improved:
+        improved = False
+        for i in range(1, len(tour) - 1):
+            for j in range(i + 1, len(tour)):
+                before, first, last = tour[i - 1], tour[i], tour[j]
+                after = tour[j + 1] if j + 1 < len(tour) else None
+                gain = length[before, first] - length[before, last]
+                if after is not None:
+                    gain += length[last, after] - length[first, after]
+                if gain < _SMALLEST_GAIN_RAD:
+                    continue
+                new = [(before, last)] + ([] if after is None else [(first, after)])
+                turned = [(b, a) for a, b in pairwise(tour[i : j + 1])]  # the same ways, the other way round
+                if all(sweep_clear(points[a], points[b], camera) for a, b in [*new, *turned]):
+                    tour[i : j + 1] = tour[i : j + 1][::-1]
+                    improved = True
+    return [i - 1 for i in tour[1:]]
 
 
 def plan_path(
@@ -227,9 +211,9 @@ def _join(
     """Keeps the waypoints that a clear straight motion joins to the one before, or two via the start."""
     q, index = [start], [VIA]
     for waypoint, view in zip(waypoints, views, strict=True):
-        if not _sweep_clear(q[-1], waypoint, camera):
+        if not sweep_clear(q[-1], waypoint, camera):
             via = unwrap_near(start, q[-1], JOINT_LIMIT)
-            if not (_sweep_clear(q[-1], via, camera) and _sweep_clear(via, waypoint, camera)):
+            if not (sweep_clear(q[-1], via, camera) and sweep_clear(via, waypoint, camera)):
                 continue
             q.append(via)
             index.append(VIA)
@@ -264,25 +248,19 @@ def _plan(q: list[Floats], index: list[int], wished: int) -> JointPlan:
     return JointPlan(np.array(q), np.array(index, dtype=np.intp), missing)
 
 
-def _sweep_clear(q_from: Floats, q_to: Floats, camera: CarriedCamera) -> bool:
-    count = 2 + int(np.abs(q_to - q_from).max() / _SWEEP_STEP_RAD)
-    return bool(is_clear(q_from + np.linspace(0, 1, count)[1:, None] * (q_to - q_from), camera).all())
+def most_diverse(poses: SE3, count: int, worth: Floats) -> Indices:
+    """Indices of poses whose rotations differ usefully for a hand-eye calibration, in increasing order.
 
-
-def _most_diverse(poses: SE3, count: int) -> Indices:
-    """Farthest-point sampling by the angle between orientations."""
-    chosen = [0]
+    Farthest-point sampling. Two rotations are as far apart as the sine of the angle between them: a small
+    one says little, and at half a turn the axis can no longer be told. Each distance is weighed with the
+    pose's worth (N,); the most worthy one comes first.
+    """
+    chosen = [int(np.argmax(worth))]
     nearest = np.full(len(poses), np.inf)
     for _ in range(count - 1):
         trace = np.einsum("nij,ij->n", poses.rotation, poses[chosen[-1]].rotation)
-        nearest = np.minimum(nearest, np.arccos(np.clip((trace - 1) / 2, -1, 1)))
-        chosen.append(int(nearest.argmax()))
+        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+        nearest = np.minimum(nearest, np.sin(np.minimum(angle, np.pi - 1e-9)))
+        nearest[chosen] = -1.0
+        chosen.append(int((nearest * worth).argmax()))
     return np.sort(np.array(chosen, dtype=np.intp))
-
-
-def _distance(points: Floats, start: Floats, end: Floats) -> Floats:
-    """(..., K) distances from points (..., K, 3) to the segment between `start` and `end` (..., 3)."""
-    along = (end - start)[..., None, :]
-    offset = points - start[..., None, :]
-    part = np.clip((offset * along).sum(axis=-1) / (along * along).sum(axis=-1), 0, 1)
-    return np.asarray(np.linalg.norm(offset - part[..., None] * along, axis=-1))

@@ -12,12 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from dataset.errors import ToolkitError
 from dataset.intrinsics import Intrinsics
 from dataset.transforms import SE3, rotation_error_deg
+from dataset.view_sphere import ViewSphere
 
 Floats = NDArray[np.float64]
 
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 _BOARD_GRID = 7  # points a side that stand for the board when its visibility is judged
 _ATTEMPTS_PER_VIEW = 200
+_LEAST_VISIBLE = 0.7
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, roll: ArrayLike = 0.0, up: ArrayLike = (0.0, 0.0, 1.0)) -> SE3:
@@ -77,8 +79,6 @@ def hand_eye_views(
     centre = T_base_board.apply(size / 2)
     normal = T_base_board.rotation[:, 2] * (1.0 if T_base_board.rotation[2, 2] >= 0 else -1.0)
     fill = float(np.max(size[:2] * np.diag(intrinsics.K)[:2] / (intrinsics.width, intrinsics.height)))
-    grid = np.stack(np.meshgrid(*[np.linspace(0, side, _BOARD_GRID) for side in board_size]), axis=-1)
-    points = T_base_board.apply(np.concatenate([grid.reshape(-1, 2), np.zeros((_BOARD_GRID**2, 1))], axis=1))
     views: list[SE3] = []
     for _ in range(count * _ATTEMPTS_PER_VIEW):
         if len(views) == count:
@@ -90,7 +90,7 @@ def hand_eye_views(
         view = look_at(
             centre + distance * direction, target, np.deg2rad(largest_roll_deg) * rng.uniform(-1, 1)
         )
-        if _visible(points, view, intrinsics) >= 0.7:
+        if board_visibility(view, T_base_board, board_size, intrinsics) >= _LEAST_VISIBLE:
             views.append(view)
     raise ToolkitError(
         f"found {len(views)} of {count} views that show a board of {size[0]:.2f} x {size[1]:.2f} m; check "
@@ -158,6 +158,32 @@ def hemisphere_path(
     return _on_sphere(centre, np.concatenate(radii), azimuth, elevation_rad)
 
 
+def board_visibility(
+    T_base_cam: SE3, T_base_board: SE3, board_size: tuple[float, float], intrinsics: Intrinsics
+) -> Floats:
+    """(...) the fraction of a board that each view (...), a pose or a batch, has in its image.
+
+    Args:
+        T_base_cam: the views.
+        T_base_board: as for `hand_eye_views`.
+        board_size: width and height, metres.
+        intrinsics: of the image.
+    """
+    grid = np.stack(np.meshgrid(*[np.linspace(0, side, _BOARD_GRID) for side in board_size]), axis=-1)
+    points = T_base_board.apply(np.concatenate([grid.reshape(-1, 2), np.zeros((_BOARD_GRID**2, 1))], axis=1))
+    T_cam_base = T_base_cam.inverse()
+    in_camera = (T_cam_base[..., None] if T_cam_base.batch else T_cam_base).apply(points)
+    x, y = np.moveaxis(intrinsics.project(in_camera), -1, 0)  # NaN behind the camera: not in the image
+    inside = (x >= 0) & (x <= intrinsics.width - 1) & (y >= 0) & (y <= intrinsics.height - 1)
+    return np.asarray(inside.mean(axis=-1))
+
+
+def seen_cells(T_base_cam: SE3, centre: ArrayLike, sphere: ViewSphere) -> NDArray[np.bool_]:
+    """(C,) which cells of the sphere of views about `centre` (3,) the cameras stand in; its mean is the
+    coverage."""
+    return sphere.count(T_base_cam.translation - np.asarray(centre, dtype=np.float64)) > 0
+
+
 def rotation_spread_deg(poses: SE3) -> float:
     """The largest rotation between two of the poses, degrees: what a hand-eye calibration lives on."""
     return float(rotation_error_deg(poses[:, None], poses[None, :]).max())
@@ -176,13 +202,3 @@ def _tilted(normal: Floats, tilt: float, azimuth: float) -> Floats:
     across /= np.linalg.norm(across)
     side = np.cos(azimuth) * across + np.sin(azimuth) * np.cross(normal, across)
     return np.asarray(np.cos(tilt) * normal + np.sin(tilt) * side)
-
-
-def _visible(points: Floats, T_base_cam: SE3, intrinsics: Intrinsics) -> float:
-    """The fraction of points (N, 3) in the base frame that fall into the image."""
-    in_camera = T_base_cam.inverse().apply(points)
-    if in_camera[:, 2].min() <= 0:
-        return 0.0
-    x, y = intrinsics.project(in_camera).T
-    inside = (x >= 0) & (x <= intrinsics.width - 1) & (y >= 0) & (y <= intrinsics.height - 1)
-    return float(inside.mean())

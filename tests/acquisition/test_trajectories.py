@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from acquisition.kinematics import JOINT_LIMIT, forward, link_transforms
-from acquisition.planning import VIA, CarriedCamera, configurations, is_clear, plan_path, plan_stills
+from acquisition.clearance import CarriedCamera, is_clear
+from acquisition.planning import VIA, configurations, plan_path, plan_stills
 from acquisition.simulation.arm import HOME
 from acquisition.trajectories import (
     hand_eye_views,

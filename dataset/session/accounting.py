@@ -40,7 +40,7 @@ def account(session: Session) -> FrameAccount:
 def unexplained(
     ids: NDArray[np.int64], dropped: NDArray[np.int64], pauses: NDArray[np.void] | None
 ) -> NDArray[np.int64]:
-    """(N-1,) frames missing between consecutive stored ids (N,) that no ledger entry and no pause explains."""
+    """(N-1,) frames missing between consecutive stored ids (N,) that neither ledger nor pause explains."""
     if pauses is None:
         pauses = np.empty(0, PAUSE_DTYPE)
     inside = np.searchsorted(np.unique(dropped), ids)

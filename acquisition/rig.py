@@ -20,7 +20,7 @@ from dataset.errors import ToolkitError
 Vector3 = tuple[float, float, float]
 Pose6 = tuple[float, float, float, float, float, float]
 
-CameraDriver = Literal["aravis"]
+CameraDriver = Literal["aravis", "harvesters"]
 RobotDriver = Literal["ur"]
 
 EXAMPLE = Path(__file__).with_name("rig.example.toml")
@@ -32,7 +32,7 @@ class CameraTable(CameraConfig):
     """[camera]: the fields of `CameraConfig`, and the driver that opens it."""
 
     driver: CameraDriver = "aravis"
-    """`aravis`: GigE Vision through the Aravis library."""
+    """`aravis`: GigE Vision through the Aravis library; `harvesters`: the GenTL producer of the maker."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +137,12 @@ def _aravis(config: CameraConfig) -> Camera:
     return AravisCamera(config)
 
 
+def _harvesters(config: CameraConfig) -> Camera:
+    from acquisition.cameras.harvesters import HarvestersCamera
+
+    return HarvestersCamera(config)
+
+
 def _ur(config: RobotConfig) -> Robot:
     from acquisition.robots.ur import UrRobot
 
@@ -149,6 +155,9 @@ def _ur_poses(config: RobotConfig) -> PoseSource:
     return UrReceiver(config)
 
 
-_CAMERAS: dict[CameraDriver, Callable[[CameraConfig], Camera]] = {"aravis": _aravis}
+_CAMERAS: dict[CameraDriver, Callable[[CameraConfig], Camera]] = {
+    "aravis": _aravis,
+    "harvesters": _harvesters,
+}
 _ROBOTS: dict[RobotDriver, Callable[[RobotConfig], Robot]] = {"ur": _ur}
 _POSE_SOURCES: dict[RobotDriver, Callable[[RobotConfig], PoseSource]] = {"ur": _ur_poses}

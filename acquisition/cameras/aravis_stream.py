@@ -58,8 +58,8 @@ class FrameGrabber:
         self._thread.start()
 
     def stop(self) -> tuple[Any, ...]:
-        """Ends the thread; returns what the caller has to let go of: the buffers, and the stream that writes to
-        them. A tuple is emptied from its end, so the stream goes first."""
+        """Ends the thread; returns what the caller has to let go of: the buffers, and the stream that writes
+        to them. A tuple is emptied from its end, so the stream goes first."""
         self._stopping.set()
         self._thread.join()
         self._stream.set_emit_signals(False)

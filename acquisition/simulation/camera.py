@@ -2,7 +2,10 @@
 
 Run as ``python -m acquisition.simulation.camera``; from Python, `SimulatedCamera` does. Commands on stdin:
 ``clock`` answers the origin (host monotonic ns) and drift (ppm) of the camera's clock, ``statistics`` the
-frames sent and how many of them late, ``lost-ratio X`` and ``latency-s X`` set; any other goes to the source.
+frames sent and how many of them late. Faults: ``lost-ratio X`` of the packets, ``latency-s X`` of the frames,
+``clock-jump S`` seconds forward (or back), ``stall S`` seconds in which it neither sends nor answers,
+``stuck-auto yes`` for an exposure that stays automatic, ``ptp-master yes`` for a network with a master clock.
+Any other command goes to the source.
 """
 
 from __future__ import annotations
@@ -13,8 +16,8 @@ import importlib
 import json
 import os
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +26,9 @@ from numpy.typing import NDArray
 from acquisition.process import ChildProcess, die_with_parent, serve_commands
 from acquisition.simulation.fake_device import Exposure, FakeDevice
 from dataset.errors import ToolkitError
+from dataset.on_camera import compute_on_camera
 from dataset.pixel_formats import pack, pixel_format
+from dataset.polarimetry import Raw
 
 if TYPE_CHECKING:
     from acquisition.simulation.patterns import FrameSource
@@ -44,6 +49,10 @@ class CameraClock:
         elapsed = host_ns - self.origin_ns
         return elapsed + round(elapsed * self.drift_ppm * 1e-6)
 
+    def jumped(self, seconds: float) -> CameraClock:
+        """This clock after it was set forward, or back."""
+        return replace(self, origin_ns=self.origin_ns - round(seconds * 1e9 / (1 + self.drift_ppm * 1e-6)))
+
 
 class Sensor:
     """Exposes when the device asks, and delivers a constant latency later, whatever the rendering costs.
@@ -58,31 +67,40 @@ class Sensor:
         self, source: FrameSource, width: int, height: int, clock: CameraClock, latency_s: float
     ) -> None:
         self.latency_s = latency_s
+        self.stall_s = 0.0
+        self.clock = clock
         self.frames = 0
         self.late = 0
         self._source = source
         self._size = (height, width)
-        self._clock = clock
 
     def fill(self, exposure: Exposure, memory: NDArray[np.uint8]) -> int:
         """See `fake_device.Fill`."""
-        start_ns = time.monotonic_ns()
+        stall_s, self.stall_s = self.stall_s, 0.0
+        time.sleep(stall_s)
+        start_ns, wall_ns = time.monotonic_ns(), time.time_ns()
         height, width = self._size
         mosaic = self._source.frame(
-            exposure.format.name, height, width, exposure.exposure_us, exposure.gain_db, start_ns
+            exposure.format.raw_name, height, width, exposure.exposure_us, exposure.gain_db, start_ns
         )
         if mosaic.shape != self._size:
             raise ToolkitError(f"the source made a frame of {mosaic.shape}, the sensor has {self._size}")
-        rows = slice(exposure.y, exposure.y + exposure.height)
-        columns = slice(exposure.x, exposure.x + exposure.width)
-        memory[:] = pack(mosaic[rows, columns], exposure.format)
+        memory[:] = pack(_region(compute_on_camera(mosaic, exposure.format), exposure), exposure.format)
         self.frames += 1
         remaining_s = self.latency_s - (time.monotonic_ns() - start_ns) * 1e-9
         if remaining_s > 0:
             time.sleep(remaining_s)
         else:
             self.late += 1
-        return self._clock.to_camera(start_ns)
+        return wall_ns if exposure.synchronized else self.clock.to_camera(start_ns)
+
+
+def _region(frame: Raw, exposure: Exposure) -> Raw:
+    """What a client asked for of the sensor; dark where a careless one asked for more than there is."""
+    seen = frame[exposure.y :, exposure.x :][: exposure.height, : exposure.width]
+    region: Raw = np.zeros((exposure.height, exposure.width), frame.dtype)
+    region[: seen.shape[0], : seen.shape[1]] = seen
+    return region
 
 
 class SimulatedCamera(ChildProcess):
@@ -113,6 +131,14 @@ class SimulatedCamera(ChildProcess):
     def set_lost_ratio(self, ratio: float) -> None:
         """From now on loses this fraction of the stream's packets."""
         self.command(f"lost-ratio {ratio}")
+
+    def jump_clock(self, seconds: float) -> None:
+        """Sets the camera's clock forward, or back."""
+        self.command(f"clock-jump {seconds}")
+
+    def stall(self, seconds: float) -> None:
+        """From the next frame on neither sends nor answers for so long."""
+        self.command(f"stall {seconds}")
 
 
 def load_source(specification: str, arguments: Mapping[str, Any]) -> FrameSource:
@@ -147,7 +173,8 @@ def _serve(options: argparse.Namespace) -> None:
     source = load_source(options.source, options.source_args)
     format_ = pixel_format(options.pixel_format)
     # The first frame may compile or load something, and the device cannot answer meanwhile.
-    source.frame(format_.name, options.height, options.width, 10_000.0, 0.0, time.monotonic_ns())
+    source.frame(format_.raw_name, options.height, options.width, 10_000.0, 0.0, time.monotonic_ns())
+    pack(np.zeros((4, 4), np.uint16), pixel_format("BayerRG12p"))
     clock = CameraClock(time.monotonic_ns(), options.drift_ppm)
     sensor = Sensor(source, options.width, options.height, clock, options.latency_s)
     device = FakeDevice(
@@ -164,25 +191,45 @@ def _serve(options: argparse.Namespace) -> None:
         lost_ratio=options.lost_ratio,
     )
 
+    device.set_ptp_master(_yes(options.ptp_master))
+
+    def jump(seconds: float) -> None:
+        sensor.clock = sensor.clock.jumped(seconds)
+
+    def set_on_sensor(name: str) -> Callable[[str], None]:
+        return lambda value: setattr(sensor, name, float(value))
+
+    faults: dict[str, Callable[[str], None]] = {
+        "lost-ratio": lambda value: device.set_lost_ratio(float(value)),
+        "latency-s": set_on_sensor("latency_s"),
+        "stall": set_on_sensor("stall_s"),
+        "clock-jump": lambda value: jump(float(value)),
+        "stuck-auto": lambda value: device.stick_exposure_auto(_yes(value)),
+        "ptp-master": lambda value: device.set_ptp_master(_yes(value)),
+    }
+
     def handle(line: str) -> str:
         verb, _, value = line.partition(" ")
         if verb == "clock":
-            return f"{clock.origin_ns} {clock.drift_ppm}"
+            return f"{sensor.clock.origin_ns} {sensor.clock.drift_ppm}"
         if verb == "statistics":
             return f"frames {sensor.frames} late {sensor.late}"
-        if verb == "lost-ratio":
-            device.set_lost_ratio(float(value))
-            return ""
-        if verb == "latency-s":
-            sensor.latency_s = float(value)
+        if verb in faults:
+            faults[verb](value)
             return ""
         command = getattr(source, "command", None)
         if command is None:
-            raise ValueError(f"unknown command '{line}'; use clock, statistics, lost-ratio X or latency-s X")
+            raise ValueError(f"unknown command '{line}'; use one of clock, statistics, {', '.join(faults)}")
         return str(command(line))
 
     with contextlib.closing(device):
         serve_commands(handle)
+
+
+def _yes(value: str) -> bool:
+    if value not in ("yes", "no"):
+        raise ValueError(f"'{value}' is neither yes nor no")
+    return value == "yes"
 
 
 def _parse() -> argparse.Namespace:
@@ -207,6 +254,7 @@ def _parse() -> argparse.Namespace:
     add("--drift-ppm", type=float, default=0.0, help="how much too fast the camera's clock runs")
     add("--trigger-poll-hz", type=float, default=100.0, help="how often the device looks for a trigger")
     add("--lost-ratio", type=float, default=0.0, help="fraction of stream packets to lose")
+    add("--ptp-master", choices=("yes", "no"), default="no", help="whether the network has a master clock")
     return parser.parse_args()
 
 

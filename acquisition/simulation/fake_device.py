@@ -34,8 +34,9 @@ _PIXEL_FORMAT, _PERIOD_US, _TRIGGER_MODE, _PACKET_SIZE = 0x128, 0x138, 0x300, 0x
 _STRINGS = {"vendor": (0x48, 32), "model": (0x68, 32), "version": (0x88, 32), "info": (0xA8, 48)}
 # A client writes 1 to start and 0 to stop; to the device everything but 0 means on.
 _ACQUISITION, _STARTED, _IN_STEP = 0x124, 1, 2
-# Ours, as genicam.xml has it.
-_EXPOSURE_AUTO, _AUTO_CONTINUOUS = 0xA000, 2
+# Ours, as genicam.xml has them.
+_EXPOSURE_AUTO, _BALANCE_WHITE_AUTO, _AUTO_CONTINUOUS = 0xA000, 0xA018, 2
+_PTP_ENABLE, _PTP_MASTER, _GAMMA_ENABLE, _EXPOSURE_AUTO_STUCK = 0xA00C, 0xA020, 0xA014, 0xA01C
 
 # The device answers nobody while it waits for its beat.
 _LONGEST_WAIT_US = 250_000
@@ -47,7 +48,14 @@ _FILL = ctypes.CFUNCTYPE(
 
 @dataclass(frozen=True)
 class Exposure:
-    """What the device asks of the callback: one frame, its region of interest and its settings."""
+    """What the device asks of the callback: one frame, its region of interest and its settings.
+
+    Attributes:
+        format: to send.
+        x, y, width, height: of the region, the sensor's pixels.
+        exposure_us, gain_db: as a client set them.
+        synchronized: whether the camera's clock follows an IEEE 1588 master.
+    """
 
     format: PixelFormat
     x: int
@@ -56,6 +64,7 @@ class Exposure:
     height: int
     exposure_us: float
     gain_db: float
+    synchronized: bool = False
 
 
 # Writes the packed frame into the array of its bytes, and returns the camera's timestamp in nanoseconds.
@@ -89,8 +98,10 @@ class FakeDevice:
         self._library = _load_library()
         self._gv = aravis.GvFakeCamera.new_full(address, serial, str(GENICAM_XML))
         if not self._gv.is_running():
+            # Aravis wants an address that a card bears; 127.0.0.2 can be bound to without one that does.
             raise DeviceError(
-                f"the simulated camera cannot listen on {address}; is it an address of this machine?"
+                f"the simulated camera cannot listen on {address}, which no network card has; add it with: "
+                f"ip addr add {address}/8 dev lo"
             )
         self._camera = self._gv.get_fake_camera()
         self._pointer = _pointer_of(self._camera)
@@ -103,8 +114,10 @@ class FakeDevice:
             (_PIXEL_FORMAT, format_.code),
             (_PERIOD_US, round(1e6 / frame_rate)),
             (_PACKET_SIZE, packet_size),
-            # As cameras come out of the box: a client has to lock it.
+            # As cameras come out of the box: a client has to lock them.
             (_EXPOSURE_AUTO, _AUTO_CONTINUOUS),
+            (_BALANCE_WHITE_AUTO, _AUTO_CONTINUOUS),
+            (_GAMMA_ENABLE, 1),
         ):
             self._camera.write_register(register, value)
         texts = {"vendor": "Lucid Vision Labs", "model": model, "version": "1.0", "info": "S2P3 simulation"}
@@ -125,10 +138,21 @@ class FakeDevice:
             raise ValueError(f"the ratio of lost packets is {ratio}; it must be between 0 and 1")
         self._gv.set_property("gvsp-lost-ratio", ratio)
 
+    def set_ptp_master(self, present: bool) -> None:
+        """Whether the network has a master clock that the camera can follow."""
+        self._camera.write_register(_PTP_MASTER, int(present))
+
+    def stick_exposure_auto(self, stuck: bool) -> None:
+        """Whether automatic exposure stays on, whatever a client writes."""
+        self._camera.write_register(_EXPOSURE_AUTO_STUCK, int(stuck))
+
     def close(self) -> None:
         """Ends the device's thread and frees its port."""
         self._camera = None
         self._gv = None
+
+    def _synchronized(self) -> bool:
+        return all(self._camera.read_register(register)[1] for register in (_PTP_ENABLE, _PTP_MASTER))
 
     def _fall_into_step(self) -> None:
         """Delays the first frame of an acquisition to the device's beat.
@@ -148,14 +172,16 @@ class FakeDevice:
     def _on_fill(self, buffer: int, user: int | None, exposure_us: int, gain: int, code: int) -> None:
         try:
             library = self._library
+            format_ = pixel_format(code)
             exposure = Exposure(
-                format=pixel_format(code),
-                x=library.arv_buffer_get_image_x(buffer),
-                y=library.arv_buffer_get_image_y(buffer),
-                width=library.arv_buffer_get_image_width(buffer),
-                height=library.arv_buffer_get_image_height(buffer),
+                format=format_,
+                x=format_.cell * library.arv_buffer_get_image_x(buffer),
+                y=format_.cell * library.arv_buffer_get_image_y(buffer),
+                width=format_.cell * library.arv_buffer_get_image_width(buffer),
+                height=format_.cell * library.arv_buffer_get_image_height(buffer),
                 exposure_us=float(exposure_us),
                 gain_db=gain / 10.0,
+                synchronized=self._synchronized(),
             )
             self._fall_into_step()
             # The size that Aravis could report is that of received data, none here.

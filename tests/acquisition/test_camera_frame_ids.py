@@ -36,3 +36,16 @@ def test_differences_survive_any_number_of_wraps(first: int, gaps: list[int]) ->
         true_ids.append(true_ids[-1] + gap)
     block_ids = [(true_id - 1) % 65535 + 1 for true_id in true_ids]
     assert unwrap(block_ids) == true_ids
+
+
+def test_ids_go_on_when_the_camera_counts_anew() -> None:
+    ids = FrameIds()
+    assert [ids.unwrap(block_id) for block_id in (65534, 65535, 1)] == [65534, 65535, 65536]
+    ids.resume()
+    assert [ids.unwrap(block_id) for block_id in (65401, 65402, 65404)] == [65537, 65538, 65540]
+
+
+def test_resuming_before_the_first_frame_changes_nothing() -> None:
+    ids = FrameIds()
+    ids.resume()
+    assert ids.unwrap(7) == 7

@@ -54,7 +54,9 @@ def annotate(
             f"calibration: no pose of {model.name!r} (objects: {known}); "
             "touch it and run `s2p3 calibrate object` first"
         )
-    write_calibration(path, calibration.to_json(), calibration.intrinsics.intrinsics)
+    write_calibration(
+        path, calibration.to_json(), calibration.intrinsics.intrinsics, calibration.polarizer_response
+    )
     write_object(path, model.to_record())
     with Session.open(path) as session:
         cameras = camera_poses(session, calibration)

@@ -18,10 +18,17 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from acquisition.capture import capture_board, capture_board_motion, capture_sequence, capture_touches
+from acquisition.capture import (
+    capture_board,
+    capture_board_motion,
+    capture_sequence,
+    capture_tool_tip,
+    capture_touches,
+)
 from acquisition.rig import Rig
 from calibration import BoardSpec, Calibration
-from calibration.steps import add_hand_eye, add_intrinsics, add_object, add_time_offset
+from calibration.steps import add_hand_eye, add_intrinsics, add_time_offset
+from calibration.touch_steps import add_object, add_tool_tip
 from dataset.errors import ToolkitError
 from dataset.splits import split_session
 from s2p3 import objects
@@ -52,6 +59,8 @@ class Plan:
     board_views: int
     motion_s: float
     """Seconds of filming the board while the arm moves, for the clock offset."""
+    pivots: int
+    """Poses about the tip, for its place on the tool."""
     touches: int
     """Points on the object touched with the tip."""
     sequence_s: float
@@ -60,8 +69,12 @@ class Plan:
     """Synthetic frames to train on."""
 
 
-FULL = Plan(preset="fast", board_views=24, motion_s=14.0, touches=40, sequence_s=110.0, synthetic=1200)
-QUICK = Plan(preset="quick", board_views=14, motion_s=8.0, touches=30, sequence_s=14.0, synthetic=64)
+FULL = Plan(
+    preset="fast", board_views=24, motion_s=14.0, pivots=20, touches=40, sequence_s=110.0, synthetic=1200
+)
+QUICK = Plan(
+    preset="quick", board_views=14, motion_s=8.0, pivots=12, touches=30, sequence_s=14.0, synthetic=64
+)
 
 
 _WORKERS = 2
@@ -117,7 +130,8 @@ class Demo:
         self.lab_folder = out / "lab"
         self.calibration = out / "calibration.json"
         self.board, self.motion = out / "board.h5", out / "board_motion.h5"
-        self.touches, self.sequence = out / "touches.h5", out / "sequence.h5"
+        self.tilts, self.touches = out / "tool_tip.h5", out / "touches.h5"
+        self.sequence = out / "sequence.h5"
         self.synthetic = out / "synthetic.h5"
         self.detector = out / "detector" / "detector.safetensors"
         self.teacher = out / "teacher" / "teacher.safetensors"
@@ -144,7 +158,7 @@ class Demo:
             ("intrinsics", "calibrate the camera", self.calibrate_camera),
             ("hand_eye", "calibrate camera to arm", self.calibrate_hand_eye),
             ("time_offset", "calibrate the clocks", self.calibrate_clocks),
-            ("touch", "touch the object with the tip", self.touch_object),
+            ("touch", "calibrate the tip, and touch the object with it", self.touch_object),
             ("sequence", "film the object", self.film_object),
             ("annotate", "annotate every frame", self.annotate),
             ("synthesize", "synthesize training images", self.synthesize),
@@ -175,15 +189,17 @@ class Demo:
             add_time_offset(self.motion, self._spec, self.calibration, report)
 
     def touch_object(self) -> None:
-        count = self.plan.touches
-        operator = Operator(self._truth, self._rig_path, count)
+        pivots, touches, model = self.plan.pivots, self.plan.touches, self.model
+        operator = Operator(self._truth, self._rig_path)
         self._open_lab()
-        with operator, recording("points") as report, operator.touching():
-            capture_touches(self.rig, self._fresh(self.touches), count=count, on_progress=report)
-        tip = self.rig.frames.T_tcp_tip
-        model = self.model
+        with operator:
+            with recording("tilts about the tip") as report, operator.pivoting(pivots):
+                capture_tool_tip(self.rig, self._fresh(self.tilts), count=pivots, on_progress=report)
+            with recording("points") as report, operator.touching(touches):
+                capture_touches(self.rig, self._fresh(self.touches), count=touches, on_progress=report)
+        add_tool_tip(self.tilts, self.calibration)
         add_object(
-            self.touches, tip, model.name, model.vertices, model.faces, self.calibration, model.symmetry.axis
+            self.touches, model.name, model.vertices, model.faces, self.calibration, model.symmetry.axis
         )
 
     def film_object(self) -> None:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calibration import Calibration, html
 from calibration.steps import report_path
 from dataset.session import Session
@@ -33,6 +35,7 @@ TARGETS = {
     ("hand_eye", "rot_deg"): Target("hand-eye rotation", "deg", 0.05),
     ("hand_eye", "trans_mm"): Target("hand-eye translation", "mm", 0.5),
     ("clock", "offset_err_ms"): Target("clock offset", "ms", 1.0),
+    ("tool_tip", "err_mm"): Target("tool tip", "mm", 0.2),
     ("object", "rot_deg"): Target("object rotation", "deg", 0.3),
     ("object", "trans_mm"): Target("object position", "mm", 1.0),
 }
@@ -54,10 +57,11 @@ def compare(
         runs: evaluations "teacher", "before" and "after".
         seconds: of every step.
     """
-    calibration.require("intrinsics", "hand_eye", "time_offset")
+    calibration.require("intrinsics", "hand_eye", "time_offset", "tool_tip")
     assert calibration.intrinsics is not None
     assert calibration.hand_eye is not None
     assert calibration.time_offset is not None
+    assert calibration.tool_tip is not None
     found = calibration.objects[truth.object_name].T_base_obj
     captured, dropped = _frames(sessions)
     summaries = {name: run.summary for name, run in runs.items()}
@@ -71,6 +75,9 @@ def compare(
             "trans_mm": float(translation_error_mm(calibration.hand_eye.T_tcp_cam, truth.T_tcp_cam)),
         },
         "clock": {"offset_err_ms": 1e3 * abs(calibration.time_offset.offset_s - truth.time_offset_s)},
+        "tool_tip": {
+            "err_mm": 1e3 * float(np.linalg.norm(calibration.tool_tip.tip_in_tcp - np.array(truth.tcp_tip)))
+        },
         "object": {
             "rot_deg": _object_rotation_deg(found, truth),
             "trans_mm": float(translation_error_mm(found, truth.T_base_object)),

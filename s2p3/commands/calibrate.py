@@ -4,6 +4,7 @@ beside it.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,11 @@ def board(*, rig: Path, out: Path, px_per_square: int = 300) -> None:
 
 
 def intrinsics(
-    session: tyro.conf.Positional[Path], *, rig: Path, calibration: Path = Path("calibration.json")
+    session: tyro.conf.Positional[Path],
+    *,
+    rig: Path,
+    calibration: Path = Path("calibration.json"),
+    apply: tuple[Path, ...] = (),
 ) -> None:
     """Estimate K and lens distortion from stills of the board.
 
@@ -47,6 +52,7 @@ def intrinsics(
         session: recorded with s2p3 capture intrinsics or hand-eye.
         rig: rig.toml with the [board] table.
         calibration: calibration.json to add the result to.
+        apply: sessions to write the calibration into.
     """
     from calibration.steps import add_intrinsics
 
@@ -57,10 +63,15 @@ def intrinsics(
         f"fx {fx:.2f} +- {done.covariance[0, 0] ** 0.5:.2f} px, "
         f"reprojection {done.rms_px:.3f} px, held out {done.held_out_px:.3f} px"
     )
+    _apply(calibration, apply)
 
 
 def hand_eye(
-    session: tyro.conf.Positional[Path], *, rig: Path, calibration: Path = Path("calibration.json")
+    session: tyro.conf.Positional[Path],
+    *,
+    rig: Path,
+    calibration: Path = Path("calibration.json"),
+    apply: tuple[Path, ...] = (),
 ) -> None:
     """Estimate where the camera sits on the arm's tool, from stills of the board.
 
@@ -68,16 +79,22 @@ def hand_eye(
         session: recorded with s2p3 capture hand-eye.
         rig: rig.toml with the [board] table.
         calibration: calibration.json that has the intrinsics; the result is added.
+        apply: sessions to write the calibration into.
     """
     from calibration.steps import add_hand_eye
 
     with counting("detect the board") as report:
         done = add_hand_eye(session, board_of(rig), calibration, report)
     say(f"hand-eye from {done.views} views: held out {done.held_out_mm:.3f} mm, {done.held_out_deg:.4f} deg")
+    _apply(calibration, apply)
 
 
 def time_offset(
-    session: tyro.conf.Positional[Path], *, rig: Path, calibration: Path = Path("calibration.json")
+    session: tyro.conf.Positional[Path],
+    *,
+    rig: Path,
+    calibration: Path = Path("calibration.json"),
+    apply: tuple[Path, ...] = (),
 ) -> None:
     """Estimate the delay between the camera's and the arm's time, from the board filmed in motion.
 
@@ -85,53 +102,122 @@ def time_offset(
         session: recorded with s2p3 capture board-motion.
         rig: rig.toml with the [board] table.
         calibration: calibration.json that has intrinsics and hand-eye; the result is added.
+        apply: sessions to write the calibration into.
     """
     from calibration.steps import add_time_offset
 
     with counting("detect the board") as report:
         done = add_time_offset(session, board_of(rig), calibration, report)
     say(f"time offset {1e3 * done.offset_s:.2f} +- {1e3 * done.sigma_s:.2f} ms")
+    _apply(calibration, apply)
+
+
+def tool_tip(
+    session: tyro.conf.Positional[Path],
+    *,
+    calibration: Path = Path("calibration.json"),
+    apply: tuple[Path, ...] = (),
+) -> None:
+    """Estimate where the measuring tip is on the tool, from tilting it about one point.
+
+    Args:
+        session: recorded with s2p3 capture tool-tip.
+        calibration: calibration.json to add the result to.
+        apply: sessions to write the calibration into.
+    """
+    from calibration.touch_steps import add_tool_tip
+
+    done = add_tool_tip(session, calibration)
+    x, y, z = 1e3 * done.tip_in_tcp
+    sigma = 1e3 * float(done.covariance.trace()) ** 0.5
+    slipped = f"; {done.slipped} slipped and left out" if done.slipped else ""
+    say(
+        f"tool tip at {x:.3f} {y:.3f} {z:.3f} mm +- {sigma:.3f} mm from {done.poses} poses, "
+        f"{1e3 * done.rms_m:.3f} mm rms{slipped}"
+    )
+    _apply(calibration, apply)
+
+
+def polarizer(
+    session: tyro.conf.Positional[Path],
+    *,
+    calibration: Path = Path("calibration.json"),
+    extinction_ratio: float = float("inf"),
+    apply: tuple[Path, ...] = (),
+) -> None:
+    """Estimate gain, extinction and orientation of every pixel's polarizer, from turning one before the lens.
+
+    Args:
+        session: recorded with s2p3 capture polarizer.
+        calibration: calibration.json to add the result to; the pixels go into a file beside it.
+        extinction_ratio: of the polarizer that was turned, T_max / T_min, from its data sheet.
+        apply: sessions to write the calibration into.
+    """
+    from calibration.polarizer_steps import add_polarizer
+
+    with counting("read the frames") as report:
+        done = add_polarizer(session, calibration, extinction_ratio, report)
+    say(
+        f"polarizers from {done.frames} frames: extinction {done.extinction_ratio[1]:.0f} (median), "
+        f"orientation +- {math.degrees(done.orientation_sigma_rad):.2f} deg, "
+        f"gain +- {100 * done.gain_sigma:.2f} %"
+    )
+    for warning in done.warnings:
+        say(f"warning: {warning}")
+    _apply(calibration, apply)
 
 
 def object_pose(
-    touches: tyro.conf.Positional[Path],
+    touches: tyro.conf.Positional[tuple[Path, ...]],
     *,
     object: ObjectName,
     rig: OptionalPath = None,
     mesh: OptionalPath = None,
+    ball_radius: float = 0.0,
     calibration: Path = Path("calibration.json"),
+    apply: tuple[Path, ...] = (),
 ) -> None:
     """Estimate where an object stands in the arm's base frame, from points touched on it.
 
     Args:
-        touches: session of s2p3 capture tool-tip, or a text file of points in the base frame (x y z, metres).
+        touches: sessions of s2p3 capture touches, or text files of points in the base frame (x y z, metres);
+            the poses that several give are fused.
         object: cup, fork, knife, bottle, or the name of the object in --mesh.
-        rig: rig.toml with the tip's position; needed with a session.
+        rig: rig.toml with the tip's position; needed with a session while the tip is not calibrated.
         mesh: PLY, OBJ or STL of the object, metres.
+        ball_radius: of the tip, metres; 0 for a pointed one.
         calibration: calibration.json to add the result to.
+        apply: sessions to write the calibration into.
     """
-    from calibration.steps import add_object
+    from acquisition.rig import Rig
+    from calibration.touch_steps import add_object, known_tip
+    from calibration.touches import KnownTip
+    from dataset.errors import ToolkitError
     from s2p3.objects import named_object
 
+    if not touches:
+        raise ToolkitError("no touches given: name a session of s2p3 capture touches, or a file of points")
     model = named_object(object, mesh)
-    tip = _tip(touches, rig)
-    done = add_object(touches, tip, model.name, model.vertices, model.faces, calibration, model.symmetry.axis)
+    guess = None if rig is None else Rig.load(rig).frames.T_tcp_tip
+    tip = KnownTip.exactly((0.0, 0.0, 0.0), ball_radius)  # a file of points was measured with it already
+    if any(path.suffix in (".h5", ".hdf5") for path in touches):
+        tip = known_tip(calibration, guess, ball_radius)
+    done = add_object(touches, model.name, model.vertices, model.faces, calibration, model.symmetry.axis, tip)
     blind = f"; not observable: {', '.join(done.unobservable)}" if done.unobservable else ""
     say(f"{object} from {done.points} points: {1e3 * done.rms_m:.3f} mm from the surface{blind}")
+    _apply(calibration, apply)
 
 
-def _tip(touches: Path, rig: Path | None) -> tuple[float, float, float]:
-    """The measuring tip in the tool's frame; a file of points was measured with it already."""
-    from acquisition.rig import Rig
-    from dataset.errors import ToolkitError
+def _apply(calibration: Path, sessions: tuple[Path, ...]) -> None:
+    """Writes the calibration into sessions, and says what each got."""
+    from calibration import Calibration, apply_calibration
 
-    if rig is not None:
-        return Rig.load(rig).frames.T_tcp_tip
-    if touches.suffix in (".h5", ".hdf5"):
-        raise ToolkitError(
-            f"{touches} is a session: give --rig, whose [frames] T_tcp_tip says where the tip is"
-        )
-    return (0.0, 0.0, 0.0)
+    for session in sessions:
+        done = apply_calibration(session, Calibration.load(calibration))
+        found = {"intrinsics": done.intrinsics, "polarizers": done.polarizer}
+        parts = [name for name, there in found.items() if there]
+        poses = f", the camera's pose in {done.poses} of {done.frames} frames" if done.poses else ""
+        say(f"{session}: {' and '.join(parts)} applied{poses}")
 
 
 def board_of(rig: Path) -> BoardSpec:

@@ -1,4 +1,5 @@
-"""The person in the simulated lab who guides the arm by hand and touches the object with the measuring tip.
+"""The person in the simulated lab who guides the arm by hand: tilts it about its tip, touches the object with
+the tip; and who turns a polarizer before the lens.
 
 A process of its own: it knows where the object is, as eyes do; the toolkit only reads the arm meanwhile.
 """
@@ -9,26 +10,30 @@ import argparse
 import threading
 import time
 from _thread import interrupt_main
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acquisition.process import ChildProcess, die_with_parent, serve_commands
-from acquisition.rig import Rig
+from acquisition.rig import Rig, RobotTable
 from acquisition.robots.ur import UrRobot
 from dataset.errors import ToolkitError
 from dataset.transforms import SE3
 from s2p3 import objects
-from s2p3.lab.truth import LabTruth
+from s2p3.lab.polarizer import HandHeldPolarizer
+from s2p3.lab.truth import NOMINAL_OBJECT_CENTRE, LabTruth
 
 _CANDIDATES = 600
 _HOLD_S = 0.9
 """How long the tip rests on a point; the recorder wants 0.6 s."""
+_PIVOT_POINT = (NOMINAL_OBJECT_CENTRE[0], 0.0, 0.06)
+"""A punched hole on a block between board and object."""
 _RETREAT_M = 0.04
 _NORMAL_WEIGHT = 0.25
 """Of a difference in normals against one in position, in diameters, when touches are spread."""
@@ -37,47 +42,101 @@ _CLEARANCE_M = 0.002
 
 
 class Operator(ChildProcess):
-    """Starts the operator; from then on touches point after point until it has touched `count`."""
+    """Starts the operator, who is then asked for one thing after the other."""
 
-    def __init__(self, truth_path: Path, rig_path: Path, count: int) -> None:
-        arguments = ("--truth", str(truth_path), "--rig", str(rig_path), "--count", str(count))
+    def __init__(self, truth_path: Path, rig_path: Path) -> None:
+        arguments = ("--truth", str(truth_path), "--rig", str(rig_path))
         super().__init__("s2p3.lab.operator", arguments, ready_timeout_s=60.0)
-        self._count = count
-        self._leaving = threading.Event()
 
     @contextmanager
-    def touching(self) -> Iterator[None]:
-        """Touches in the background for the length of the `with` block, at whose end a failure is raised.
+    def touching(self, count: int) -> Iterator[None]:
+        """Touches so many points in the background for the length of the `with` block, at whose end a failure
+        is raised.
 
         Raises:
             DeviceError: the operator could not reach a point.
         """
+        with self._repeating("touch", count):
+            yield
+
+    @contextmanager
+    def pivoting(self, count: int) -> Iterator[None]:
+        """The same, tilting the tool about its tip, which stays in one point."""
+        with self._repeating("pivot", count):
+            yield
+
+    def turning(self, angles_rad: Iterable[float]) -> Iterator[float]:
+        """Holds the polarizer before the lens, and yields each angle as soon as it stands there; takes it
+        away in the end."""
+        try:
+            for angle in angles_rad:
+                self.command(f"turn {np.degrees(angle)}", timeout_s=10.0)
+                yield angle
+        finally:
+            self.command("clear", timeout_s=10.0)
+
+    @contextmanager
+    def _repeating(self, word: str, count: int) -> Iterator[None]:
+        leaving = threading.Event()
+
+        def repeat() -> None:
+            for _ in range(count):
+                if leaving.is_set():
+                    return
+                self.command(word, timeout_s=60.0)
+
         with ThreadPoolExecutor(1, "operator") as pool:
-            work = pool.submit(self._touch_all)
+            work = pool.submit(repeat)
             # A recorder would wait for ever for a point that is not going to be touched.
             work.add_done_callback(lambda done: interrupt_main() if done.exception() else None)
             try:
                 yield
             finally:
-                self._leaving.set()
+                leaving.set()
                 if work.done():
                     work.result()
 
-    def _touch_all(self) -> None:
-        for _ in range(self._count):
-            if self._leaving.is_set():
-                return
-            self.command("touch", timeout_s=60.0)
 
-
-def touch(truth: LabTruth, rig: Rig, count: int) -> Iterator[int]:
-    """Touches `count` points spread over the object, one at a time, and yields how many it has touched."""
+def pivot(truth: LabTruth, rig: Rig) -> Generator[int, None, None]:
+    """Tilts the tool about its tip from one pose to the next, for ever, and yields how many it has held."""
     T_tip_tcp = SE3.from_rotvec(np.zeros(3), -np.array(truth.tcp_tip))
-    by_hand = replace(rig.robot, speed=0.6, acceleration=2.0, joint_speed=2.0, joint_acceleration=5.0)
-    with UrRobot(by_hand) as arm:
+    rng = np.random.default_rng(truth.seed + 4)
+    with UrRobot(_by_hand(rig)) as arm:
+        held, q = 0, arm.sample().q
+        for tilt in _tilts(rng):
+            slip = rng.normal(0, truth.pivot_noise_m, 3)
+            q_next = arm.inverse_kinematics(SE3(tilt, np.array(_PIVOT_POINT) + slip) @ T_tip_tcp, q)
+            if q_next is None or np.abs(q_next - q).max() > np.pi:
+                continue
+            arm.follow(q_next[None])
+            time.sleep(_HOLD_S)
+            held, q = held + 1, q_next
+            yield held
+
+
+def _tilts(rng: np.random.Generator) -> Iterator[NDArray[np.float64]]:
+    """Rotations of a tool that points down, tilted to all sides in turn and turned about itself, for ever."""
+    down = np.diag([1.0, -1.0, -1.0])
+    for index in count():
+        azimuth = index * np.pi * (3 - np.sqrt(5))
+        tilt = np.radians(rng.uniform(18, 32)) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        turn = np.array([0.0, 0.0, rng.uniform(-0.6, 0.6)])
+        rotation = SE3.from_rotvec(np.stack([tilt, turn]), np.zeros((2, 3))).rotation
+        yield rotation[0] @ down @ rotation[1]
+
+
+def _by_hand(rig: Rig) -> RobotTable:
+    """The arm as one guides it: faster than it would go by itself."""
+    return replace(rig.robot, speed=0.6, acceleration=2.0, joint_speed=2.0, joint_acceleration=5.0)
+
+
+def touch(truth: LabTruth, rig: Rig) -> Generator[int, None, None]:
+    """Touches points spread over the object, one at a time, for ever, and yields how many it has touched."""
+    T_tip_tcp = SE3.from_rotvec(np.zeros(3), -np.array(truth.tcp_tip))
+    with UrRobot(_by_hand(rig)) as arm:
         q = arm.sample().q
         touched = 0
-        while touched < count:
+        while True:
             before = touched
             for point, normal in _contacts(truth, _CANDIDATES):
                 contact = _tip_pose(point, normal) @ T_tip_tcp
@@ -92,8 +151,6 @@ def touch(truth: LabTruth, rig: Rig, count: int) -> Iterator[int]:
                 q = q_retreat
                 touched += 1
                 yield touched
-                if touched == count:
-                    return
             if touched == before:
                 raise ToolkitError("the operator reaches no point of the object; try another --seed")
 
@@ -146,21 +203,40 @@ def _tip_pose(point: NDArray[np.float64], normal: NDArray[np.float64]) -> SE3:
 
 
 def main() -> None:
-    """Touches until done; the process then waits for its parent to end it."""
+    """Does what it is told, line by line; the process ends with its parent."""
     die_with_parent()
-    parser = argparse.ArgumentParser(description="Touches the object of a simulated lab with the arm's tip.")
+    parser = argparse.ArgumentParser(description="Touches, tilts and turns things in a simulated lab.")
     parser.add_argument("--truth", type=Path, required=True)
     parser.add_argument("--rig", type=Path, required=True)
-    parser.add_argument("--count", type=int, required=True)
     options = parser.parse_args()
-    touches = touch(LabTruth.load(options.truth), Rig.load(options.rig), options.count)
+    truth, rig = LabTruth.load(options.truth), Rig.load(options.rig)
+    polarizer = HandHeldPolarizer(options.truth)
+    at_work: dict[str, Generator[int, None, None]] = {}
 
     def handle(line: str) -> str:
-        if line != "touch":
-            raise ValueError(f"unknown command '{line}'; use touch")
-        return str(next(touches, options.count))
+        word, *angle = line.split()
+        if word == "turn" and len(angle) == 1:
+            polarizer.turn_to(np.radians(float(angle[0])))
+            return angle[0]
+        if word == "clear":
+            polarizer.take_away()
+            return "clear"
+        if word not in _HANDIWORK:
+            raise ValueError(f"unknown command '{line}'; use touch, pivot, turn DEGREES or clear")
+        if word not in at_work:
+            for other in at_work.values():
+                other.close()  # lets go of the arm
+            at_work.clear()
+            at_work[word] = _HANDIWORK[word](truth, rig)
+        return str(next(at_work[word]))
 
     serve_commands(handle)
+
+
+_HANDIWORK: dict[str, Callable[[LabTruth, Rig], Generator[int, None, None]]] = {
+    "touch": touch,
+    "pivot": pivot,
+}
 
 
 if __name__ == "__main__":

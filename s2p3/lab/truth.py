@@ -59,6 +59,8 @@ class LabTruth:
     """Of the pixels' polarizers, about the nominal."""
     read_noise: float
     full_well: float
+    pivot_noise_m: float
+    """Standard deviation of the tip's place in the hole it is tilted in, an axis."""
     touch_noise_m: float
     """Standard deviation of a touched point along the surface normal: the tip's ball, the operator's hand."""
 
@@ -187,6 +189,7 @@ def sample_truth(
         gain_sigma=0.02,
         read_noise=2.5,
         full_well=10_000.0,
+        pivot_noise_m=3e-5,
         touch_noise_m=1e-4,
         tcp_tip=tuple(float(c) for c in np.array(TCP_TIP) + rng.uniform(-TIP_PLAY_M, TIP_PLAY_M, 3)),
     )

@@ -14,7 +14,9 @@ from dataset.validate import validate
 from s2p3.demo import Demo, Plan, Progress
 from s2p3.demo_report import TARGETS
 
-SMALL = Plan(preset="quick", board_views=12, motion_s=8.0, touches=20, sequence_s=10.0, synthetic=24)
+SMALL = Plan(
+    preset="quick", board_views=12, motion_s=8.0, pivots=8, touches=20, sequence_s=10.0, synthetic=24
+)
 SETTINGS: dict[str, object] = {"object": "cup", "seed": 1}
 
 
@@ -42,8 +44,8 @@ def test_demo_recovers_the_hidden_truth_and_never_reads_it(tmp_path: Path) -> No
     assert 0 <= recall["after"] <= 100
     assert json.loads((tmp_path / "result.json").read_text()) == result
     assert "Recovered, against the hidden truth" in (tmp_path / "report.html").read_text()
-    for recording in ("board.h5", "board_motion.h5", "touches.h5", "sequence.h5", "synthetic.h5"):
-        assert validate(tmp_path / recording) == [], recording
+    for recording in ("board", "board_motion", "tool_tip", "touches", "sequence", "synthetic"):
+        assert validate(tmp_path / f"{recording}.h5") == [], recording
     with Session.open(tmp_path / "sequence.h5") as session:
         splits = session.splits
         assert sum(map(len, splits.values())) == len(session)

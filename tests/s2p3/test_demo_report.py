@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration import Calibration, HandEyeRecord, IntrinsicsRecord, ObjectPoseRecord, TimeOffsetRecord
+from calibration import (
+    Calibration,
+    HandEyeRecord,
+    IntrinsicsRecord,
+    ObjectPoseRecord,
+    TimeOffsetRecord,
+    ToolTipRecord,
+)
 from dataset import SE3
 from s2p3 import objects
 from s2p3.demo_report import TARGETS, compare
@@ -29,7 +36,8 @@ def recovered(truth: LabTruth) -> Calibration:
     arm = HandEyeRecord(truth.T_tcp_cam, truth.T_base_board, np.eye(12), 0.1, 0.1, 0.01, 1e-5, 1e-5, 20, ())
     pose = ObjectPoseRecord(truth.T_base_object, np.eye(6), 1e-4, 40, (), ())
     clock = TimeOffsetRecord(truth.time_offset_s, 1e-4, 0.1, ())
-    return Calibration(None, camera, arm, clock, None, {truth.object_name: pose})
+    tip = ToolTipRecord(np.array(truth.tcp_tip), np.eye(3), 1e-4, 12, 0, np.zeros(6), ())
+    return Calibration(None, camera, arm, clock, tip, objects={truth.object_name: pose})
 
 
 def runs(name: str) -> dict[str, Evaluation]:

@@ -54,6 +54,13 @@ class Observations:
             view_count=len(detections),
         )
 
+    def take(self, views: NDArray[np.intp]) -> Observations:
+        """The views with these indices, in this order; one may come more than once."""
+        starts = np.searchsorted(self.view, np.arange(self.view_count + 1))
+        corners = np.concatenate([np.arange(starts[v], starts[v + 1]) for v in views])
+        renumbered = np.repeat(np.arange(len(views)), starts[views + 1] - starts[views])
+        return Observations(renumbered, self.board[corners], self.pixels[corners], len(views))
+
     def of_views(self, keep: Bools) -> Observations:
         """Only the views where ``keep`` (view_count,) holds, renumbered without gaps."""
         corners = keep[self.view]
@@ -93,6 +100,10 @@ class State(Protocol):
     def deviation(self) -> Floats:
         """(view_count, L): how far each view's own parameters are from where the prior expects them."""
 
+    @property
+    def shared_deviation(self) -> Floats:
+        """(S,) how far the shared parameters are from where their prior expects them."""
+
     def linearize(self, observations: Observations) -> Linearization:
         """Residuals and derivatives at these values."""
 
@@ -131,6 +142,7 @@ def solve(
     pixel_sigma: float,
     own_sigma: Floats,
     free: Bools,
+    shared_information: Floats | None = None,
 ) -> tuple[S, Solution]:
     """Minimise the corners' whitened residuals plus the views' whitened deviations from their prior.
 
@@ -141,11 +153,13 @@ def solve(
         pixel_sigma: standard deviation of a corner's coordinate, pixels.
         own_sigma: (view_count, L) prior of the views' own parameters; inf where there is none.
         free: (S,) which shared parameters may move.
+        shared_information: (S, S) of a prior on the shared parameters; none when None.
 
     Returns:
         The state at the minimum, and residuals and covariances there.
     """
-    problem = _Problem(observations, pixel_sigma, own_sigma**-2.0, free)
+    information = np.zeros((len(free), len(free))) if shared_information is None else shared_information
+    problem = _Problem(observations, pixel_sigma, own_sigma**-2.0, free, information)
     normal = problem.build(state)
     damping = 1e-4
     for _ in range(_MAX_STEPS):
@@ -184,6 +198,7 @@ class _Problem:
     pixel_sigma: float
     own_information: Floats
     free: Bools
+    shared_information: Floats
 
     def build(self, state: State) -> _Normal:
         linear = state.linearize(self.observations)
@@ -197,15 +212,17 @@ class _Problem:
         shared_T = np.swapaxes(linear.by_shared, 1, 2) * information[:, None, None]
         residual = linear.residual[..., None]
         deviation = state.deviation
+        shared_pull = self.shared_information @ state.shared_deviation
+        shared_cost = float(state.shared_deviation @ shared_pull)
         return _Normal(
-            cost=float(loss.sum() + np.sum(self.own_information * deviation**2)),
+            cost=float(loss.sum() + np.sum(self.own_information * deviation**2)) + shared_cost,
             residual=linear.residual,
             weight=weight,
-            shared=np.sum(shared_T @ linear.by_shared, axis=0),
+            shared=np.sum(shared_T @ linear.by_shared, axis=0) + self.shared_information,
             own=by_view(own_T @ linear.by_own)
             + self.own_information[:, :, None] * np.eye(self.own_information.shape[1]),
             cross=by_view(own_T @ linear.by_shared),
-            gradient_shared=np.sum(shared_T @ residual, axis=0)[:, 0],
+            gradient_shared=np.sum(shared_T @ residual, axis=0)[:, 0] + shared_pull,
             gradient_own=by_view(own_T @ residual)[..., 0] + self.own_information * deviation,
         )
 

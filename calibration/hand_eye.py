@@ -1,9 +1,8 @@
-"""Where the camera sits on the arm's tool, and where the board lies in the arm's base frame (eye in hand).
+"""Where the camera sits and where the board lies, from views of the board at known poses of the arm.
 
-A X = X B by OpenCV's closed forms, then one joint refinement on reprojection in which the arm is allowed to
-have been a little off in every view. How far off, against how noisy the corners are, is not assumed: both
-are estimated with the unknowns (variance components, Förstner 1979), since the arm's noise usually dwarfs
-that of the corners.
+Eye in hand: T_tcp_cam and T_base_board. Eye to hand: T_base_cam and T_tcp_board. All closed forms and RANSAC
+side by side, the best of them refined on reprojection with the arm's noise in the model
+(`calibration.hand_eye_model`); on request the camera's parameters and the clocks' offset are refined, too.
 """
 
 from __future__ import annotations
@@ -14,35 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board import BoardSpec
-from calibration.bundle import (
-    Bools,
-    Floats,
-    Linearization,
-    Observations,
-    Solution,
-    cross_matrix,
-    project_with_derivatives,
-    solve,
-)
-from calibration.closed_forms import closed_forms
+from calibration.bundle import Bools, Floats, Observations, Solution, solve
+from calibration.closed_forms import Mount, arm_reading, closed_forms, ransac
 from calibration.detection import Detection
+from calibration.hand_eye_model import (
+    CAMERA,
+    LOOSE_ARM,
+    OFFSET,
+    SCALE,
+    TRANSFORMS,
+    Fit,
+    HandEyeState,
+    TimedArm,
+    fit,
+)
 from calibration.intrinsics import board_pose
 from calibration.observability import MIN_POSES, RotationSpread, require_observable
 from dataset.errors import CalibrationError
 from dataset.intrinsics import Intrinsics
 from dataset.transforms import SE3, rotation_error_deg, translation_error_mm
 
-_LOOSE_ARM = np.array([1e-3] * 3 + [2e-3] * 3)  # m, rad: before the arm's noise is known
-_ARM_FLOOR = np.array(
-    [2e-6] * 3 + [5e-6] * 3
-)  # no arm repeats better; keeps the variance components positive
-_PIXEL_FLOOR = 5e-3
 _MAX_ERROR = 5.0  # of the views' median error: farther off is an outlier
 _NO_ARM_M = 10e-3  # a typical arm is never this wrong: the poses are not what they are taken for
 _NO_ARM_RAD = np.radians(2.0)
-_FOLDS = 5
-_TRANSFORMS = 12  # shared parameters before the board's scale and the camera's own
-_SCALE = 12
 _WRONG_SCALE = 0.02
 
 
@@ -51,28 +44,38 @@ class HandEyeResult:
     """What N views from N arm poses say.
 
     Attributes:
-        T_tcp_cam, T_base_board: the two transforms.
-        covariance: (12, 12) of the twists [rho, phi] dX, dZ (m, rad) in T_tcp_cam @ exp(dX), T_base_board @
-            exp(dZ), the uncertainty of the intrinsics included when it was given.
+        mount: who carries the camera.
+        T_mount_cam: the camera on the tool (eye in hand) or in the base (eye to hand).
+        T_fixture_board: the board in the base (eye in hand) or on the tool (eye to hand).
+        covariance: (12, 12) of the twists [rho, phi] dX, dZ (m, rad) in T_mount_cam @ exp(dX),
+            T_fixture_board @ exp(dZ), the uncertainty of the intrinsics included when it was given.
+        intrinsics: as given, or refined on request.
+        offset_s, offset_sigma_s: to add to the camera's times; zero when the arm was at rest.
         rms_px: distance between seen and predicted corners when every view may be off by the arm's noise.
         rigid_rms_px: the same when the arm's poses are taken at their word.
         arm_sigma_m, arm_sigma_rad, pixel_sigma: the noise estimated, a coordinate.
         used: (N,) False for views rejected as outliers.
         view_rms_px: (N,) like rigid_rms_px, a view.
-        held_out_mm, held_out_deg: median error of the board's pose predicted in views left out (5-fold).
+        held_out_mm, held_out_deg: median error of the board's pose predicted in a view left out, each view in
+            its turn.
         spread: of the tool's rotation.
-        candidates_px: the closed forms' median corner error, by name.
+        candidates_px: the closed forms' and RANSAC's median corner error, by name.
         board_scale, board_scale_sigma: the board's size against its description, as the arm's motion
             measures it.
-        T_base_cam: N camera poses.
+        T_base_cam, T_base_board_seen: N camera poses, and N poses of the board by the arm and the result.
         board_size_m: width and height of the board, for drawing it.
         view, pixels, residual_px: (P,), (P, 2), (P, 2) every corner: its view, where seen, rigid predicted -
             seen.
+        fit, observations: the minimum and the corners of the views used, for bootstrap and next pose.
     """
 
-    T_tcp_cam: SE3
-    T_base_board: SE3
+    mount: Mount
+    T_mount_cam: SE3
+    T_fixture_board: SE3
     covariance: Floats
+    intrinsics: Intrinsics
+    offset_s: float
+    offset_sigma_s: float
     rms_px: float
     rigid_rms_px: float
     arm_sigma_m: float
@@ -87,20 +90,58 @@ class HandEyeResult:
     board_scale: float
     board_scale_sigma: float
     T_base_cam: SE3
+    T_base_board_seen: SE3
     board_size_m: tuple[float, float]
     view: NDArray[np.int64]
     pixels: Floats
     residual_px: Floats
+    fit: Fit
+    observations: Observations
+
+    @property
+    def T_tcp_cam(self) -> SE3:
+        """The camera on the tool.
+
+        Raises:
+            CalibrationError: the camera stands still (eye to hand).
+        """
+        return self._of("eye_in_hand", self.T_mount_cam)
+
+    @property
+    def T_base_board(self) -> SE3:
+        """The board in the base.
+
+        Raises:
+            CalibrationError: the board is on the tool (eye to hand).
+        """
+        return self._of("eye_in_hand", self.T_fixture_board)
+
+    @property
+    def T_tcp_board(self) -> SE3:
+        """The board on the tool.
+
+        Raises:
+            CalibrationError: the board stands still (eye in hand).
+        """
+        return self._of("eye_to_hand", self.T_fixture_board)
 
     @property
     def sigma_m(self) -> float:
-        """Standard deviation of T_tcp_cam's position (root sum of squares of the axes), metres."""
+        """Standard deviation of T_mount_cam's position (root sum of squares of the axes), metres."""
         return float(np.sqrt(np.trace(self.covariance[:3, :3])))
 
     @property
     def sigma_rad(self) -> float:
-        """Standard deviation of T_tcp_cam's rotation (root sum of squares of the axes), radians."""
+        """Standard deviation of T_mount_cam's rotation (root sum of squares of the axes), radians."""
         return float(np.sqrt(np.trace(self.covariance[3:6, 3:6])))
+
+    def _of(self, mount: Mount, pose: SE3) -> SE3:
+        if self.mount != mount:
+            raise CalibrationError(
+                f"hand-eye: this is a calibration {self.mount.replace('_', ' ')}; it has no transform of a"
+                f" calibration {mount.replace('_', ' ')}: use T_mount_cam and T_fixture_board"
+            )
+        return pose
 
 
 def calibrate_hand_eye(
@@ -109,150 +150,168 @@ def calibrate_hand_eye(
     spec: BoardSpec,
     intrinsics: Intrinsics,
     intrinsics_covariance: Floats | None = None,
+    mount: Mount = "eye_in_hand",
+    refine_camera: bool = False,
+    moving: TimedArm | None = None,
 ) -> HandEyeResult:
-    """Estimate T_tcp_cam and T_base_board from N views of a fixed board.
+    """Estimate where the camera and the board are from N views.
 
     Args:
         T_base_tcp: N arm poses at the exposures.
         detections: N, one a view, corners in mosaic pixels.
         spec: the board.
-        intrinsics: at the mosaic's pixel grid; held fixed.
+        intrinsics: at the mosaic's pixel grid.
         intrinsics_covariance: (4 + n, 4 + n); widens the result's covariance.
+        mount: who carries the camera.
+        refine_camera: refine the intrinsics, too, starting from ``intrinsics_covariance``.
+        moving: when the views were taken in motion: the clocks' offset is refined, too.
 
     Raises:
         CalibrationError: poses that do not determine the transform (see `require_observable`), a board whose
-            size contradicts the arm's motion, or views that fit no common transform.
+            size contradicts the arm's motion, views that fit no common transform, or intrinsics to refine
+            without their covariance.
     """
     if len(T_base_tcp) != len(detections):
         raise CalibrationError(
             f"hand-eye: {len(T_base_tcp)} arm poses for {len(detections)} detections; give one pose a view"
         )
-    spread = require_observable(T_base_tcp)
+    if refine_camera and intrinsics_covariance is None:
+        raise CalibrationError(
+            "hand-eye: intrinsics can only be refined from where their covariance expects them; give"
+            " intrinsics_covariance, or run `s2p3 calibrate intrinsics`"
+        )
+    spread = require_observable(T_base_tcp, mount)
     observations = Observations.collect(detections, spec)
     T_cam_board = SE3.stack([board_pose(d, spec, intrinsics) for d in detections])
-    state, candidates = _best_closed_form(T_base_tcp, T_cam_board, intrinsics, observations)
+    start = HandEyeState(
+        mount, SE3.identity(), SE3.identity(), intrinsics, T_base_tcp, np.zeros((len(T_base_tcp), 6))
+    )
+    start = replace(start, moving=moving).at_offset(0.0)
+    state, candidates = _best_start(start, T_cam_board, observations)
     used, state = _reject_outlier_views(state, observations)
-    require_observable(T_base_tcp[used])
+    require_observable(T_base_tcp[used], mount)
     kept = observations.of_views(used)
-    state_used, solution, sigmas = _refine(state.of_views(used), kept)
-    scale, scale_sigma = _board_scale(state_used, kept, sigmas)
+    free = state.free(offset=moving is not None, camera=refine_camera)
+    state = replace(state.take(used), scale=1.0)
+    information = None
+    if refine_camera and intrinsics_covariance is not None:
+        information = np.zeros((len(free), len(free)))
+        information[CAMERA, CAMERA] = np.linalg.inv(intrinsics_covariance)
+    found = fit(replace(state, expected=state), kept, free, information)
+    scale, scale_sigma = _board_scale(found, kept)
     if abs(scale - 1) > max(_WRONG_SCALE, 6 * scale_sigma):
         raise CalibrationError(
             f"hand-eye: measured by the arm's motion the board is {scale:.3f} times the size described;"
-            " square_m is"
-            f" {spec.square_m:g}, it should be about {spec.square_m * scale:.4f} m (measure it), or the"
-            " arm's poses"
-            " are not in metres"
+            f" square_m is {spec.square_m:g}, it should be about {spec.square_m * scale:.4f} m"
+            " (measure it), or the arm's poses are not in metres"
         )
-    rigid = replace(state_used, T_base_tcp=T_base_tcp, offset=np.zeros((len(T_base_tcp), 6)))
-    residual = rigid.linearize(observations).residual
-    corner_used = used[observations.view]
-    held_out_mm, held_out_deg = _held_out(state_used, kept, sigmas, T_cam_board[used])
+    return _result(
+        found,
+        kept,
+        start,
+        used,
+        observations,
+        T_cam_board,
+        spread,
+        candidates,
+        spec,
+        (scale, scale_sigma),
+        None if refine_camera else intrinsics_covariance,
+    )
+
+
+def _result(
+    found: Fit,
+    kept: Observations,
+    start: HandEyeState,
+    used: Bools,
+    observations: Observations,
+    T_cam_board: SE3,
+    spread: RotationSpread,
+    candidates: dict[str, float],
+    spec: BoardSpec,
+    scale: tuple[float, float],
+    intrinsics_covariance: Floats | None,
+) -> HandEyeResult:
+    state, solution = found.state, found.solution
+    whole = replace(
+        start,
+        T_mount_cam=state.T_mount_cam,
+        T_fixture_board=state.T_fixture_board,
+        camera=state.camera,
+    ).at_offset(state.offset_s)
+    residual = whole.linearize(observations).residual
+    reading = arm_reading(whole.T_base_tcp, whole.mount)
+    eye_in_hand = whole.mount == "eye_in_hand"
+    count = len(whole.T_base_tcp)
+    T_base_cam = reading @ state.T_mount_cam if eye_in_hand else _repeat(state.T_mount_cam, count)
+    board = _repeat(state.T_fixture_board, count)
+    covariance, names = _with_intrinsics(found, intrinsics_covariance), np.flatnonzero(found.free)
+    offset_variance = covariance[names == OFFSET][:, names == OFFSET]
+    held_out_mm, held_out_deg = leave_one_out(found, kept, T_cam_board[used])
     return HandEyeResult(
-        T_tcp_cam=state_used.T_tcp_cam,
-        T_base_board=state_used.T_base_board,
-        covariance=_with_intrinsics(solution, intrinsics_covariance),
+        mount=state.mount,
+        T_mount_cam=state.T_mount_cam,
+        T_fixture_board=state.T_fixture_board,
+        covariance=covariance[TRANSFORMS, TRANSFORMS],
+        intrinsics=state.camera,
+        offset_s=state.offset_s,
+        offset_sigma_s=float(np.sqrt(offset_variance.sum())),
         rms_px=_rms(solution.residual),
-        rigid_rms_px=_rms(residual[corner_used]),
-        arm_sigma_m=float(sigmas.arm[0]),
-        arm_sigma_rad=float(sigmas.arm[3]),
-        pixel_sigma=sigmas.pixel,
+        rigid_rms_px=_rms(residual[used[observations.view]]),
+        arm_sigma_m=float(found.sigmas.arm[0]),
+        arm_sigma_rad=float(found.sigmas.arm[3]),
+        pixel_sigma=found.sigmas.pixel,
         used=used,
         view_rms_px=observations.view_rms(residual),
         held_out_mm=held_out_mm,
         held_out_deg=held_out_deg,
         spread=spread,
         candidates_px=candidates,
-        board_scale=scale,
-        board_scale_sigma=scale_sigma,
-        T_base_cam=T_base_tcp @ state_used.T_tcp_cam,
+        board_scale=scale[0],
+        board_scale_sigma=scale[1],
+        T_base_cam=T_base_cam,
+        T_base_board_seen=board if eye_in_hand else whole.T_base_tcp @ board,
         board_size_m=spec.size_m,
         view=observations.view,
         pixels=observations.pixels,
         residual_px=residual,
+        fit=found,
+        observations=kept,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Sigmas:
-    """Noise of a corner's coordinate (px) and of the arm's pose (6,) m, rad."""
-
-    pixel: float
-    arm: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """Shared: T_tcp_cam, T_base_board, the board's scale, fx fy cx cy distortion. Own: how far the arm was
-    off."""
-
-    T_tcp_cam: SE3
-    T_base_board: SE3
-    scale: float
-    camera: Intrinsics
-    T_base_tcp: SE3
-    offset: Floats
-
-    @property
-    def deviation(self) -> Floats:
-        return self.offset
-
-    def free(self, scale: bool) -> Bools:
-        """(S,) the two transforms, and the board's scale if asked; never the camera."""
-        free = np.zeros(_TRANSFORMS + 1 + 4 + len(self.camera.distortion), bool)
-        free[:_TRANSFORMS] = True
-        free[_SCALE] = scale
-        return free
-
-    def linearize(self, observations: Observations) -> Linearization:
-        T_tcp_board = SE3.exp(-self.offset) @ self.T_base_tcp.inverse() @ self.T_base_board
-        rotation_tcp_board = T_tcp_board.rotation[observations.view]
-        board = self.scale * observations.board
-        in_tcp = T_tcp_board[observations.view].apply(board)
-        cam_R_tcp = self.T_tcp_cam.rotation.T
-        in_cam = self.T_tcp_cam.inverse().apply(in_tcp)
-        predicted, by_point, by_camera = project_with_derivatives(
-            in_cam, self.camera.K, self.camera.distortion
-        )
-        cam_R_board = cam_R_tcp @ rotation_tcp_board
-        minus_one = np.broadcast_to(-np.eye(3), (len(in_cam), 3, 3))
-        by_tcp_cam = np.concatenate([minus_one, cross_matrix(in_cam)], axis=2)
-        by_base_board = cam_R_board @ np.concatenate([-minus_one, -cross_matrix(board)], axis=2)
-        by_offset = cam_R_tcp @ np.concatenate([minus_one, cross_matrix(in_tcp)], axis=2)
-        by_scale = cam_R_board @ observations.board[..., None]
-        by_shared = by_point @ np.concatenate([by_tcp_cam, by_base_board, by_scale], axis=2)
-        return Linearization(
-            predicted - observations.pixels,
-            np.concatenate([by_shared, by_camera], axis=2),
-            by_point @ by_offset,
-        )
-
-    def moved(self, shared: Floats, own: Floats) -> _State:
-        return replace(
-            self,
-            T_tcp_cam=self.T_tcp_cam @ SE3.exp(shared[:6]),
-            T_base_board=self.T_base_board @ SE3.exp(shared[6:12]),
-            scale=self.scale + float(shared[_SCALE]),
-            offset=self.offset + own,
-        )
-
-    def of_views(self, keep: Bools) -> _State:
-        return replace(self, T_base_tcp=self.T_base_tcp[keep], offset=self.offset[keep])
+def leave_one_out(found: Fit, observations: Observations, T_cam_board: SE3) -> tuple[float, float]:
+    """Median error, mm and degrees, of the board's pose in a view that the estimate did not use, each view in
+    its turn; NaN when too few are left."""
+    count = observations.view_count
+    if count <= MIN_POSES:
+        return float("nan"), float("nan")
+    millimetres, degrees = np.empty(count), np.empty(count)
+    for left_out in range(count):
+        others = np.arange(count) != left_out
+        trained, _ = found.again(found.state.take(others), observations.of_views(others))
+        reading = arm_reading(found.state.T_base_tcp[left_out], found.state.mount)
+        predicted = (reading @ trained.T_mount_cam).inverse() @ trained.T_fixture_board
+        millimetres[left_out] = translation_error_mm(predicted, T_cam_board[left_out])
+        degrees[left_out] = rotation_error_deg(predicted, T_cam_board[left_out])
+    return float(np.median(millimetres)), float(np.median(degrees))
 
 
-def _best_closed_form(
-    T_base_tcp: SE3, T_cam_board: SE3, intrinsics: Intrinsics, observations: Observations
-) -> tuple[_State, dict[str, float]]:
+def _best_start(
+    state: HandEyeState, T_cam_board: SE3, observations: Observations
+) -> tuple[HandEyeState, dict[str, float]]:
     """Start from the method with the smallest median corner error: the median, since a few views may be
     wrong."""
-    offset = np.zeros((len(T_base_tcp), 6))
-    states = {
-        name: _State(T_tcp_cam, T_base_board, 1.0, intrinsics, T_base_tcp, offset)
-        for name, (T_tcp_cam, T_base_board) in closed_forms(T_base_tcp, T_cam_board).items()
-    }
+    reading = arm_reading(state.T_base_tcp, state.mount)
+    pairs = closed_forms(reading, T_cam_board)
+    sampled = ransac(reading, T_cam_board, np.random.default_rng(0))
+    if sampled is not None:
+        pairs["ransac"] = sampled
+    states = {name: replace(state, T_mount_cam=X, T_fixture_board=Z) for name, (X, Z) in pairs.items()}
     errors = {
-        name: float(np.median(np.linalg.norm(state.linearize(observations).residual, axis=1)))
-        for name, state in states.items()
+        name: float(np.median(np.linalg.norm(tried.linearize(observations).residual, axis=1)))
+        for name, tried in states.items()
     }
     if not errors:
         raise CalibrationError(
@@ -262,20 +321,26 @@ def _best_closed_form(
     return states[min(errors, key=lambda name: errors[name])], errors
 
 
-def _reject_outlier_views(state: _State, observations: Observations) -> tuple[Bools, _State]:
+def _reject_outlier_views(state: HandEyeState, observations: Observations) -> tuple[Bools, HandEyeState]:
     """Views whose arm pose (or board) is far off the others': reweighted until the rest agree, then named."""
     count = observations.view_count
     spread = np.ones(count)
     for _ in range(8):
-        state, _ = solve(state, observations, 0.3, _LOOSE_ARM * spread[:, None], state.free(scale=True))
-        deviation = np.linalg.norm(state.offset / _LOOSE_ARM, axis=1)
+        state, _ = solve(
+            state,
+            observations,
+            0.3,
+            LOOSE_ARM * spread[:, None],
+            state.free(scale=True, offset=state.moving is not None),
+        )
+        deviation = np.linalg.norm(state.arm_error / LOOSE_ARM, axis=1)
         typical = max(float(np.median(deviation)), 1e-3)
         # Student's t with 3 degrees of freedom: a view twice as far off as usual counts half, one far off
         # hardly.
         before, spread = spread, np.sqrt((3.0 + (deviation / typical) ** 2) / 4.0)
         if np.allclose(spread, before, rtol=0.05):
             break
-    typical_m, typical_rad = np.median(np.linalg.norm(state.offset.reshape(count, 2, 3), axis=2), axis=0)
+    typical_m, typical_rad = np.median(np.linalg.norm(state.arm_error.reshape(count, 2, 3), axis=2), axis=0)
     if typical_m > _NO_ARM_M or typical_rad > _NO_ARM_RAD:
         raise CalibrationError(
             f"hand-eye: no common transform fits, the arm would have to be off by {1000 * typical_m:.0f} mm"
@@ -286,7 +351,7 @@ def _reject_outlier_views(state: _State, observations: Observations) -> tuple[Bo
         )
     # Judged by the picture, with the arm taken at its word: a view with few corners is not an outlier for
     # that.
-    rigid = replace(state, offset=np.zeros_like(state.offset)).linearize(observations).residual
+    rigid = state.rigid().linearize(observations).residual
     error = observations.view_rms(rigid)
     used = error <= _MAX_ERROR * np.median(error) + 0.3
     if np.count_nonzero(used) < max(MIN_POSES, count // 2):
@@ -298,82 +363,25 @@ def _reject_outlier_views(state: _State, observations: Observations) -> tuple[Bo
     return used, state
 
 
-def _refine(state: _State, observations: Observations) -> tuple[_State, Solution, _Sigmas]:
-    """Alternate between the unknowns and the variance components until the noise levels settle."""
-    sigmas = _Sigmas(0.3, _LOOSE_ARM)
-    state = replace(state, scale=1.0, offset=np.zeros_like(state.offset))
-    free = state.free(scale=False)
-    for _ in range(10):
-        state, solution = _solve(state, observations, sigmas, free)
-        updated = _variance_components(state, solution, observations, sigmas)
-        settled = np.allclose(updated.arm, sigmas.arm, rtol=0.02) and np.isclose(
-            updated.pixel, sigmas.pixel, rtol=0.02
-        )
-        sigmas = updated
-        if settled:
-            break
-    state, solution = _solve(state, observations, sigmas, free)
-    return state, solution, sigmas
+def _board_scale(found: Fit, observations: Observations) -> tuple[float, float]:
+    free = found.free.copy()
+    free[SCALE] = True
+    scaled, solution = replace(found, free=free).again(found.state, observations)
+    place = int(np.count_nonzero(free[:SCALE]))
+    return scaled.scale, float(np.sqrt(solution.covariance[place, place]))
 
 
-def _solve(
-    state: _State, observations: Observations, sigmas: _Sigmas, free: Bools
-) -> tuple[_State, Solution]:
-    own_sigma = np.tile(sigmas.arm, (observations.view_count, 1))
-    return solve(state, observations, sigmas.pixel, own_sigma, free)
-
-
-def _variance_components(
-    state: _State, solution: Solution, observations: Observations, sigmas: _Sigmas
-) -> _Sigmas:
-    """Each noise from its own residuals over its own redundancy (Förstner 1979)."""
-    count = observations.view_count
-    known = (
-        np.einsum("vii->vi", solution.own_covariance) / sigmas.arm**2
-    )  # 1: the views say nothing of the arm
-    redundancy = np.maximum(count - known.sum(axis=0), 1e-6).reshape(2, 3).sum(axis=1)
-    squares = np.sum(state.offset**2, axis=0).reshape(2, 3).sum(axis=1)
-    arm = np.maximum(np.repeat(np.sqrt(squares / redundancy), 3), _ARM_FLOOR)
-    freedom = 2 * len(observations.view) - _TRANSFORMS - redundancy.sum()
-    return _Sigmas(max(solution.pixel_noise(freedom), _PIXEL_FLOOR), arm)
-
-
-def _board_scale(state: _State, observations: Observations, sigmas: _Sigmas) -> tuple[float, float]:
-    free = state.free(scale=True)
-    scaled, solution = _solve(state, observations, sigmas, free)
-    return scaled.scale, float(np.sqrt(solution.covariance[_SCALE, _SCALE]))
-
-
-def _with_intrinsics(solution: Solution, intrinsics_covariance: Floats | None) -> Floats:
-    """Adds what the fixed intrinsics' own uncertainty does to the transforms ("consider" covariance)."""
+def _with_intrinsics(found: Fit, intrinsics_covariance: Floats | None) -> Floats:
+    """Adds what the fixed intrinsics' own uncertainty does to the unknowns ("consider" covariance)."""
+    solution: Solution = found.solution
     if intrinsics_covariance is None:
         return solution.covariance
-    camera = slice(_SCALE + 1, None)
-    gain = solution.covariance @ solution.reduced_normal[:_TRANSFORMS, camera]
+    gain = solution.covariance @ solution.reduced_normal[found.free, CAMERA]
     return np.asarray(solution.covariance + gain @ intrinsics_covariance @ gain.T)
 
 
-def _held_out(
-    state: _State, observations: Observations, sigmas: _Sigmas, T_cam_board: SE3
-) -> tuple[float, float]:
-    """Median error, mm and degrees, of the board's pose in views that the estimate did not use."""
-    millimetres: list[Floats] = []
-    degrees: list[Floats] = []
-    views = np.arange(observations.view_count)
-    for fold in range(_FOLDS):
-        test = views % _FOLDS == fold
-        if np.count_nonzero(~test) < MIN_POSES - 1:
-            continue
-        trained, _ = _solve(
-            state.of_views(~test), observations.of_views(~test), sigmas, state.free(scale=False)
-        )
-        T_base_cam = state.T_base_tcp[test] @ trained.T_tcp_cam
-        predicted = T_base_cam.inverse() @ trained.T_base_board
-        millimetres.append(translation_error_mm(predicted, T_cam_board[test]))
-        degrees.append(rotation_error_deg(predicted, T_cam_board[test]))
-    if not millimetres:
-        return float("nan"), float("nan")
-    return float(np.median(np.concatenate(millimetres))), float(np.median(np.concatenate(degrees)))
+def _repeat(pose: SE3, count: int) -> SE3:
+    return SE3(np.broadcast_to(pose.rotation, (count, 3, 3)), np.broadcast_to(pose.translation, (count, 3)))
 
 
 def _rms(residual: Floats) -> float:

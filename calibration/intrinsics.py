@@ -163,6 +163,10 @@ class _State:
     def deviation(self) -> Floats:
         return np.zeros((len(self.T_cam_board), 6))
 
+    @property
+    def shared_deviation(self) -> Floats:
+        return np.zeros(4 + len(self.distortion))
+
     def linearize(self, observations: Observations) -> Linearization:
         pose = self.T_cam_board[observations.view]
         points = pose.apply(observations.board)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.closed_forms import Mount
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3
 
@@ -26,10 +27,13 @@ class RotationSpread:
     Attributes:
         axes: (3, 3) rows are principal axes of rotation in the tool's frame, largest spread first.
         rms_deg: (3,) root mean square rotation about each, degrees.
+        smallest_singular: of the stacked R_i - R_mean over sqrt(N), the matrix that the unknown position is
+            solved with: one unit of noise in the arm's position becomes 1 / (this sqrt(N)) in the unknown.
     """
 
     axes: NDArray[np.float64]
     rms_deg: NDArray[np.float64]
+    smallest_singular: float
 
 
 def rotation_spread(T_base_tcp: SE3) -> RotationSpread:
@@ -41,17 +45,24 @@ def rotation_spread(T_base_tcp: SE3) -> RotationSpread:
     _, singular, axes = np.linalg.svd(about_mean, full_matrices=True)
     rms = np.zeros(3)
     rms[: len(singular)] = np.degrees(singular / np.sqrt(len(about_mean)))
-    return RotationSpread(axes, rms)
+    apart = (T_base_tcp.rotation - T_base_tcp.rotation.mean(axis=0)).reshape(-1, 3)
+    smallest = np.linalg.svd(apart, compute_uv=False)[-1] / np.sqrt(len(T_base_tcp))
+    return RotationSpread(axes, rms, float(smallest))
 
 
-def require_observable(T_base_tcp: SE3) -> RotationSpread:
+def require_observable(T_base_tcp: SE3, mount: Mount = "eye_in_hand") -> RotationSpread:
     """The spread of N tool poses, if it determines a hand-eye transform (two rotation axes that are not
-    parallel).
+    parallel; Tsai & Lenz 1989).
+
+    Args:
+        T_base_tcp: N poses.
+        mount: names what stays unknown: the camera on the tool, or the board on it.
 
     Raises:
         CalibrationError: NaN poses, too few, the same pose repeated, no rotation, or rotation about one axis
             only (the message names the axis along which the camera's position stays unknown).
     """
+    carried = "camera" if mount == "eye_in_hand" else "board"
     bad = np.flatnonzero(~T_base_tcp.finite)
     if len(bad):
         raise CalibrationError(
@@ -73,16 +84,16 @@ def require_observable(T_base_tcp: SE3) -> RotationSpread:
     spread = rotation_spread(T_base_tcp)
     if spread.rms_deg[0] < MIN_SPREAD_DEG:
         raise CalibrationError(
-            f"hand-eye: the tool hardly rotated ({spread.rms_deg[0]:.2f} degrees rms), so the camera's"
-            " position on it is"
-            " not observable; rotate the tool by 15-30 degrees about at least two axes between views"
+            f"hand-eye: the tool hardly rotated ({spread.rms_deg[0]:.2f} degrees rms), so the {carried}'s"
+            " position on it is not observable; rotate the tool by 15-30 degrees about"
+            " at least two axes between views"
         )
     if spread.rms_deg[1] < MIN_SPREAD_DEG:
         first, second = spread.axes[0], spread.axes[1]
         raise CalibrationError(
             f"hand-eye: the tool rotated about one axis only ({_name_axis(first)}, {spread.rms_deg[0]:.1f}"
             " degrees rms;"
-            f" {spread.rms_deg[1]:.2f} about {_name_axis(second)}), so the camera's position along that"
+            f" {spread.rms_deg[1]:.2f} about {_name_axis(second)}), so the {carried}'s position along that"
             " axis is not"
             f" observable; add views tilted by 15-30 degrees about {_name_axis(second)} of the tool"
         )
@@ -90,14 +101,12 @@ def require_observable(T_base_tcp: SE3) -> RotationSpread:
 
 
 def _distinct_poses(poses: SE3) -> int:
-    kept: list[SE3] = []
-    for pose in poses:
-        moved = [pose.inverse() @ other for other in kept]
-        if all(
-            np.linalg.norm(m.translation) > _SAME_M or np.linalg.norm(m.as_rotvec()) > _SAME_RAD
-            for m in moved
-        ):
-            kept.append(pose)
+    kept: list[int] = []
+    for index in range(len(poses)):
+        moved = poses[kept].inverse() @ poses[index]
+        near = np.linalg.norm(moved.translation, axis=1) < _SAME_M
+        if not (near & (np.linalg.norm(moved.as_rotvec(), axis=1) < _SAME_RAD)).any():
+            kept.append(index)
     return len(kept)
 
 

@@ -1,10 +1,14 @@
 """Hand-eye from analytic corners, pixel noise and an arm that does not quite repeat."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calibration.detection import Detection
 from calibration.hand_eye import calibrate_hand_eye
+from calibration.next_pose import next_pose
+from calibration.resampling import bootstrap
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3, rotation_error_deg, translation_error_mm
 
@@ -26,7 +30,7 @@ def test_the_camera_on_the_tool_is_recovered_within_its_error_bars(world):
         assert translation_error_mm(result.T_tcp_cam, world.T_tcp_cam) < 0.2
         assert translation_error_mm(result.T_base_board, world.T_base_board) < 0.3
         assert result.used.all()
-        assert len(result.candidates_px) == 7
+        assert len(result.candidates_px) == 8  # seven closed forms and RANSAC
         assert abs(result.board_scale - 1) < 5 * result.board_scale_sigma < 1e-3
         error = np.concatenate(
             [
@@ -116,3 +120,81 @@ def test_an_inverted_transform_is_refused(world):
     arm, detections = _recording(world, 9)
     with pytest.raises(CalibrationError, match="hand-eye"):
         calibrate_hand_eye(arm.inverse(), detections, world.spec, world.intrinsics)
+
+
+def test_a_fixed_camera_and_a_board_on_the_tool_are_recovered_within_their_error_bars(world):
+    T_base_cam, T_tcp_board = world.T_base_board @ SE3.from_rotvec([2.0, 0.3, 0], [0, 0, 1]), world.T_tcp_cam
+    chi_square = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        views = world.views(22, rng)
+        noise = SE3.exp(rng.normal(0, 1, (len(views), 6)) * np.array([ARM_M] * 3 + [ARM_RAD] * 3))
+        arm = T_base_cam @ views @ T_tcp_board.inverse() @ noise
+        detections = [world.detection(pose, rng) for pose in views]
+        result = calibrate_hand_eye(arm, detections, world.spec, world.intrinsics, mount="eye_to_hand")
+        assert translation_error_mm(result.T_mount_cam, T_base_cam) < 1.0
+        assert translation_error_mm(result.T_tcp_board, T_tcp_board) < 0.2
+        assert translation_error_mm(result.T_base_board_seen, arm @ T_tcp_board).max() < 0.4
+        error = np.concatenate(
+            [
+                (result.T_mount_cam.inverse() @ T_base_cam).log(),
+                (result.T_tcp_board.inverse() @ T_tcp_board).log(),
+            ]
+        )
+        chi_square.append(error @ np.linalg.solve(result.covariance, error))
+    assert 5 < np.mean(chi_square) < 24  # 12 expected
+    with pytest.raises(CalibrationError, match="calibration eye to hand"):
+        _ = result.T_tcp_cam
+
+
+def test_intrinsics_that_are_off_are_refined_with_the_arm(world):
+    off = replace(world.intrinsics, K=world.intrinsics.K * np.array([[1.003], [1.003], [1.0]]))
+    covariance = np.diag([20.0, 20.0, 20.0, 20.0, 1e-5, 1e-5, 1e-8, 1e-8, 1e-5])
+    recording = _recording(world, 8)
+    fixed = calibrate_hand_eye(*recording, world.spec, off, covariance)
+    refined = calibrate_hand_eye(*recording, world.spec, off, covariance, refine_camera=True)
+    assert abs(refined.intrinsics.K[0, 0] / world.intrinsics.K[0, 0] - 1) < 5e-4
+    assert translation_error_mm(refined.T_tcp_cam, world.T_tcp_cam) < 0.3
+    assert refined.rms_px < fixed.rms_px
+    with pytest.raises(CalibrationError, match="intrinsics_covariance"):
+        calibrate_hand_eye(*recording, world.spec, off, refine_camera=True)
+
+
+def test_a_view_left_out_is_predicted_as_well_as_arm_and_corners_allow(world):
+    result = calibrate_hand_eye(*_recording(world, 9), world.spec, world.intrinsics)
+    assert 0.02 < result.held_out_mm < 0.3
+    assert 0.002 < result.held_out_deg < 0.05
+
+
+def test_bootstrap_intervals_hold_the_truth_and_agree_with_the_covariance(world):
+    held = []
+    for seed in range(3):
+        result = calibrate_hand_eye(*_recording(world, 20 + seed), world.spec, world.intrinsics)
+        intervals = bootstrap(result, draws=40)
+        error = (result.T_mount_cam.inverse() @ world.T_tcp_cam).log()
+        held.append((intervals.low < error) & (error < intervals.high))
+        half = 0.5 * (intervals.high - intervals.low)
+        assert np.all(half > 0.8 * np.sqrt(np.diagonal(result.covariance))[:6])
+        assert np.all(half < 4.0 * np.sqrt(np.diagonal(result.covariance))[:6])
+    assert np.mean(held) > 0.75
+
+
+def test_the_next_pose_taken_is_worth_what_it_promised(world):
+    arm, detections = _recording(world, 10, count=8)
+    before = calibrate_hand_eye(arm, detections, world.spec, world.intrinsics)
+    advice = next_pose(before, world.spec)
+    rng = np.random.default_rng(0)
+    seen = (advice.T_base_tcp @ world.T_tcp_cam).inverse() @ world.T_base_board
+    assert len(world.detection(seen, rng)) >= 30
+    assert "degrees" in advice.reason
+    grown = SE3.stack([*arm, advice.T_base_tcp])
+    after = calibrate_hand_eye(grown, [*detections, world.detection(seen, rng)], world.spec, world.intrinsics)
+    assert advice.sigma_m < before.sigma_m
+    # The noise levels are estimated anew with the view added: the promise holds for those assumed before it.
+    assert after.sigma_m / after.arm_sigma_m < 1.05 * before.sigma_m / before.arm_sigma_m
+
+
+def test_next_pose_is_refused_where_nothing_is_reachable(world):
+    result = calibrate_hand_eye(*_recording(world, 11, count=8), world.spec, world.intrinsics)
+    with pytest.raises(CalibrationError, match="none of"):
+        next_pose(result, world.spec, reachable=lambda poses: np.zeros(len(poses), bool))

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from acquisition.camera import Camera
 from acquisition.clearance import CarriedCamera
-from acquisition.planning import plan_path, plan_stills
 from acquisition.recorder import (
     NO_CAMERA,
     OnProgress,
@@ -29,24 +28,12 @@ from acquisition.recorder import (
 )
 from acquisition.rig import Rig, open_camera, open_pose_source, open_robot
 from acquisition.robot import Robot
-from acquisition.trajectories import hand_eye_views, hemisphere_path
+from acquisition.routes import Route, board_stills, board_sweep, carried_camera, object_sweeps
 from dataset.frames import CameraInfo
-from dataset.intrinsics import Intrinsics
 from dataset.schema import Kind
 from dataset.session import SessionWriter
-from dataset.transforms import SE3
 
 Floats = NDArray[np.float64]
-
-_CANDIDATE_VIEWS = 80
-_NOMINAL_FOCAL = 0.71
-"""Focal length in image widths, for planning only (our choice: the paper's 6 mm lens)."""
-_RADII_M = (0.38, 0.31, 0.45)
-"""Distances from which the object is filmed, one sweep after the other (our choice)."""
-_ELEVATIONS_DEG = (30.0, 80.0)
-_ROLLS = tuple(np.deg2rad((-24.0, -12.0, 0.0, 12.0, 24.0)))
-"""Turns of the camera about its axis that let the arm move smoothly; the horizon stays nearly level."""
-_BOARD_SWEEP_VIEWS = 10
 
 
 def capture_board(
@@ -70,10 +57,8 @@ def capture_board(
         DeviceError: a device does not answer or stopped.
     """
     with _devices(rig) as (camera, robot), _writer(out, kind, camera.info, rig) as writer:
-        plan = plan_stills(
-            _board_views(rig, camera.info, seed), _carried(rig, robot), robot.sample().q, views
-        )
-        return record_stills(camera, robot, plan.q, writer, on_progress=on_progress)
+        route = board_stills(rig, *_standing(rig, robot), _size(camera), views, seed)
+        return record_stills(camera, robot, route.q, writer, on_progress=on_progress)
 
 
 def capture_board_motion(
@@ -81,10 +66,9 @@ def capture_board_motion(
 ) -> Progress:
     """The board filmed while the arm moves, from which the clock offset of camera and arm is estimated."""
     with _devices(rig) as (camera, robot), _writer(out, "hand_eye", camera.info, rig) as writer:
-        views = _board_views(rig, camera.info, seed)
-        plan = plan_stills(views, _carried(rig, robot), robot.sample().q, _BOARD_SWEEP_VIEWS)
-        robot.move_joints(plan.q[0])
-        sweep = _to_and_fro(robot, [plan.q])
+        route = board_sweep(rig, *_standing(rig, robot), _size(camera), seed)
+        robot.move_joints(route.q[0])
+        sweep = _to_and_fro(robot, route)
         return record_stream(camera, robot, writer, motion=sweep, duration_s=seconds, on_progress=on_progress)
 
 
@@ -114,17 +98,9 @@ def capture_sequence(
             writer = stack.enter_context(SessionWriter.append(out, "sequence", camera.info))
         else:
             writer = stack.enter_context(_writer(out, "sequence", camera.info, rig))
-        centre = np.array(rig.frames.object_centre_guess)
-        carried = _carried(rig, robot)
-        q = robot.sample().q
-        sweeps = []
-        for radius in _RADII_M:
-            views = hemisphere_path(centre, (radius, radius), _ELEVATIONS_DEG, rows=6)
-            path = plan_path(views, carried, q, _ROLLS)
-            sweeps.append(path.q)
-            q = path.q[-1]
-        robot.move_joints(sweeps[0][0])
-        motion = _to_and_fro(robot, sweeps)
+        route = object_sweeps(rig, *_standing(rig, robot))
+        robot.move_joints(route.q[0])
+        motion = _to_and_fro(robot, route)
         return record_stream(
             camera, robot, writer, motion=motion, duration_s=seconds, on_progress=on_progress
         )
@@ -176,24 +152,18 @@ def _writer(out: Path, kind: Kind, camera: CameraInfo, rig: Rig) -> SessionWrite
     return SessionWriter(out, kind, camera, rig_toml=rig.to_toml())
 
 
-def _carried(rig: Rig, robot: Robot) -> CarriedCamera:
-    return CarriedCamera(
-        SE3.from_pose6(robot.tcp_offset), SE3.from_pose6(np.array(rig.frames.T_tcp_cam_guess))
-    )
+def _standing(rig: Rig, robot: Robot) -> tuple[CarriedCamera, Floats]:
+    """What the arm carries, and where it stands."""
+    return carried_camera(rig, robot.tcp_offset), robot.sample().q
 
 
-def _board_views(rig: Rig, camera: CameraInfo, seed: int) -> SE3:
-    focal = _NOMINAL_FOCAL * camera.width
-    matrix = np.array([[focal, 0, (camera.width - 1) / 2], [0, focal, (camera.height - 1) / 2], [0, 0, 1]])
-    rough = Intrinsics(matrix, np.zeros(0), camera.height, camera.width)
-    board = rig.board
-    size = (board.squares_x * board.square_m, board.squares_y * board.square_m)
-    pose = SE3.from_pose6(np.array(rig.frames.T_base_board_guess))
-    return hand_eye_views(pose, size, rough, _CANDIDATE_VIEWS, seed)
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.info.width, camera.info.height
 
 
-def _to_and_fro(robot: Robot, paths: list[Floats]) -> Callable[[], None]:
-    """A motion without an end: along each path, from wherever the one before it ended."""
+def _to_and_fro(robot: Robot, route: Route) -> Callable[[], None]:
+    """A motion without an end: along each of the route's paths, from wherever the one before it ended."""
+    paths = [plan.q for plan in route.plans]
 
     def move() -> None:
         for path in cycle([*paths, *[p[::-1] for p in reversed(paths)]]):

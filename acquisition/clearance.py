@@ -1,4 +1,5 @@
-"""Whether the arm, with the camera and the tool that it carries, keeps clear of the table and of itself.
+"""Whether the arm, with the camera and the tool that it carries, keeps clear of the table and of itself, and
+in its workspace.
 
 The arm is a nominal UR5e on a table; it is clear when thick points along all of it are. The shapes are our
 choice, on the cautious side. Anything else that stands in the room is not known here.
@@ -34,6 +35,7 @@ class CarriedCamera:
         length_behind, length_ahead: metres of housing behind, and of lens ahead of, the camera's centre.
         table_z: height of the table in the base frame, metres.
         table_gap: metres that everything stays above the table.
+        workspace: lower and upper corner of the box in the base frame that the tool stays in, metres.
     """
 
     T_flange_tcp: SE3
@@ -43,6 +45,10 @@ class CarriedCamera:
     length_ahead: float = 0.02
     table_z: float = 0.0
     table_gap: float = 0.03
+    workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = (
+        (-np.inf, -np.inf, -np.inf),
+        (np.inf, np.inf, np.inf),
+    )
 
     def T_base_flange(self, T_base_cam: SE3) -> SE3:
         """Where the flange is when the camera is there."""
@@ -82,14 +88,18 @@ def skeleton(q: ArrayLike) -> Floats:
 
 
 def is_clear(q: ArrayLike, camera: CarriedCamera) -> NDArray[np.bool_]:
-    """(...) bool: whether joint angles (..., 6) keep arm, camera and tool clear of the table and the arm."""
+    """(...) bool: whether joint angles (..., 6) keep arm, camera and tool clear of the table and the arm, and
+    the tool in its workspace."""
     flange = link_transforms(q)[..., 6, :, :]
     lines = skeleton(q)
     shoulder, elbow, elbow_inner, wrist = (lines[..., i, :] for i in (2, 3, 4, 5))
     points, room = camera.body()
     body = np.einsum("...ij,kj->...ki", flange[..., :3, :3], points) + flange[..., None, :3, 3]
+    tool = body[..., -1, :]
+    low, high = camera.workspace
+    inside = ((tool >= low) & (tool <= high)).all(axis=-1)
     floor = camera.table_z + camera.table_gap
-    clear = lines[..., 3:, 2].min(axis=-1) > floor + _LINK_RADIUS
+    clear = inside & (lines[..., 3:, 2].min(axis=-1) > floor + _LINK_RADIUS)
     clear &= (body[..., 2] > floor + room).all(axis=-1)
     hand = np.concatenate([lines[..., 7:, :], body], axis=-2)
     hand_room = np.concatenate([[_LINK_RADIUS, camera.radius], room])

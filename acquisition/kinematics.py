@@ -21,6 +21,9 @@ DH_ALPHA = np.array([np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0])
 JOINT_LIMIT = 2 * np.pi  # rad, either way, every joint
 JOINT_SPEED_LIMIT = np.pi  # rad/s
 
+READY = (3.14, -1.57, 1.57, -1.57, -1.57, 0.0)
+"""A bent arm above the table, its hand down: where a simulated arm stands, and a real one is taken to."""
+
 _COS_ALPHA = np.round(np.cos(DH_ALPHA))
 _SIN_ALPHA = np.round(np.sin(DH_ALPHA))
 _SINGULAR = 1e-6  # |sin q5| under which joints 4 and 6 turn about one line and only their sum is determined

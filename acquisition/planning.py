@@ -241,8 +241,8 @@ def _wind(q: Floats, start: Floats) -> Floats:
 def _plan(q: list[Floats], index: list[int], wished: int) -> JointPlan:
     if not q:
         raise ToolkitError(
-            f"the arm reaches none of {wished} views; check T_tcp_cam_guess and where the board or object is "
-            "in the rig file, or move it to 0.35-0.6 m from the arm's base"
+            f"the arm reaches none of {wished} views; check T_tcp_cam_guess, the workspace and where the "
+            "board or object is in the rig file, or move it to 0.35-0.6 m from the arm's base"
         )
     missing = np.setdiff1d(np.arange(wished), index)
     return JointPlan(np.array(q), np.array(index, dtype=np.intp), missing)

@@ -161,7 +161,7 @@ def hemisphere_path(
 def board_visibility(
     T_base_cam: SE3, T_base_board: SE3, board_size: tuple[float, float], intrinsics: Intrinsics
 ) -> Floats:
-    """(...) the fraction of a board that each view (...), a pose or a batch, has in its image.
+    """(M,) the fraction of a board that each of M views has in its image; a single pose gives a single one.
 
     Args:
         T_base_cam: the views.
@@ -172,7 +172,7 @@ def board_visibility(
     grid = np.stack(np.meshgrid(*[np.linspace(0, side, _BOARD_GRID) for side in board_size]), axis=-1)
     points = T_base_board.apply(np.concatenate([grid.reshape(-1, 2), np.zeros((_BOARD_GRID**2, 1))], axis=1))
     T_cam_base = T_base_cam.inverse()
-    in_camera = (T_cam_base[..., None] if T_cam_base.batch else T_cam_base).apply(points)
+    in_camera = (T_cam_base[:, None] if T_cam_base.batch else T_cam_base).apply(points)
     x, y = np.moveaxis(intrinsics.project(in_camera), -1, 0)  # NaN behind the camera: not in the image
     inside = (x >= 0) & (x <= intrinsics.width - 1) & (y >= 0) & (y <= intrinsics.height - 1)
     return np.asarray(inside.mean(axis=-1))

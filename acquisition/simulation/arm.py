@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from acquisition.kinematics import JOINT_LIMIT, link_transforms
+from acquisition.kinematics import JOINT_LIMIT, READY, link_transforms
 from acquisition.simulation.motion import Motion
 from dataset.transforms import SE3
 
 Floats = NDArray[np.float64]
 
 REGISTERS = 48
-HOME = (3.14, -1.57, 1.57, -1.57, -1.57, 0.0)
+HOME = READY
 
 # RTDE's safety_status_bits, safety_mode and robot_mode.
 NORMAL_BITS, PROTECTIVE_BITS, EMERGENCY_BITS = 1 << 0, 1 << 2 | 1 << 10, 1 << 6 | 1 << 7 | 1 << 10

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,55 +14,70 @@ from s2p3.commands.arguments import at_least
 from s2p3.commands.output import counting, say
 
 if TYPE_CHECKING:
+    from acquisition.clearance import CarriedCamera
     from acquisition.recorder import OnProgress, Progress
+    from acquisition.rig import Rig
+    from acquisition.routes import Floats, Route
 
 
-def intrinsics(*, rig: Path, out: Path, views: int = 24) -> None:
+def intrinsics(*, rig: Path, out: Path, views: int = 24, dry_run: bool = False) -> None:
     """Take stills of the board from diverse directions, for the camera's intrinsics.
 
     Args:
         rig: rig.toml with the devices' addresses.
         out: session file to write; never overwritten.
         views: how many stills to take.
+        dry_run: move nothing: plan, and draw the route on a page beside OUT.
     """
     from acquisition.capture import capture_board
     from acquisition.rig import Rig
 
     at_least(1, views=views)
+    if dry_run:
+        _draw_stills(Rig.load(rig), out, views)
+        return
     with recording("stills") as report:
         done = capture_board(Rig.load(rig), out, kind="intrinsics", views=views, on_progress=report)
     say(summary(out, done))
 
 
-def hand_eye(*, rig: Path, out: Path, views: int = 24) -> None:
+def hand_eye(*, rig: Path, out: Path, views: int = 24, dry_run: bool = False) -> None:
     """Take stills of the board from diverse directions, for the camera's place on the arm.
 
     Args:
         rig: rig.toml with the devices' addresses.
         out: session file to write; never overwritten.
         views: how many stills to take.
+        dry_run: move nothing: plan, and draw the route on a page beside OUT.
     """
     from acquisition.capture import capture_board
     from acquisition.rig import Rig
 
     at_least(1, views=views)
+    if dry_run:
+        _draw_stills(Rig.load(rig), out, views)
+        return
     with recording("stills") as report:
         done = capture_board(Rig.load(rig), out, kind="hand_eye", views=views, on_progress=report)
     say(summary(out, done))
 
 
-def board_motion(*, rig: Path, out: Path, seconds: float = 14.0) -> None:
+def board_motion(*, rig: Path, out: Path, seconds: float = 14.0, dry_run: bool = False) -> None:
     """Film the board while the arm moves, for the delay between the clocks.
 
     Args:
         rig: rig.toml with the devices' addresses.
         out: session file to write; never overwritten.
         seconds: how long to film.
+        dry_run: move nothing: plan, and draw the route on a page beside OUT.
     """
     from acquisition.capture import capture_board_motion
     from acquisition.rig import Rig
 
     at_least(1, seconds=seconds)
+    if dry_run:
+        _draw_sweep(Rig.load(rig), out)
+        return
     with recording("frames") as report:
         done = capture_board_motion(Rig.load(rig), out, seconds=seconds, on_progress=report)
     say(summary(out, done))
@@ -143,7 +158,9 @@ def _asked_turns(count: int, step_deg: float, unread: bool) -> Iterator[float]:
         yield float("nan") if unread else math.radians(angle)
 
 
-def sequence(*, rig: Path, out: Path, seconds: float = 60.0, append: bool = False) -> None:
+def sequence(
+    *, rig: Path, out: Path, seconds: float = 60.0, append: bool = False, dry_run: bool = False
+) -> None:
     """Film the object from all around while the arm moves.
 
     Args:
@@ -151,14 +168,50 @@ def sequence(*, rig: Path, out: Path, seconds: float = 60.0, append: bool = Fals
         out: session file to write; never overwritten.
         seconds: how long to film.
         append: go on with OUT, a sequence that was interrupted and has been repaired.
+        dry_run: move nothing: plan, and draw the route on a page beside OUT.
     """
     from acquisition.capture import capture_sequence
     from acquisition.rig import Rig
 
     at_least(1, seconds=seconds)
+    if dry_run:
+        _draw_sequence(Rig.load(rig), out)
+        return
     with recording("frames") as report:
         done = capture_sequence(Rig.load(rig), out, seconds=seconds, append=append, on_progress=report)
     say(summary(out, done))
+
+
+def _draw_stills(rig: Rig, out: Path, views: int) -> None:
+    from acquisition.dry_run import NOMINAL_SIZE
+    from acquisition.routes import board_stills
+
+    _draw(rig, out, lambda carried, q: board_stills(rig, carried, q, NOMINAL_SIZE, views))
+
+
+def _draw_sweep(rig: Rig, out: Path) -> None:
+    from acquisition.dry_run import NOMINAL_SIZE
+    from acquisition.routes import board_sweep
+
+    _draw(rig, out, lambda carried, q: board_sweep(rig, carried, q, NOMINAL_SIZE))
+
+
+def _draw_sequence(rig: Rig, out: Path) -> None:
+    from acquisition.routes import object_sweeps
+
+    _draw(rig, out, lambda carried, q: object_sweeps(rig, carried, q))
+
+
+def _draw(rig: Rig, out: Path, plan: Callable[[CarriedCamera, Floats], Route]) -> None:
+    from acquisition.dry_run import dry_run
+
+    page = out.with_suffix(".html")
+    route = dry_run(rig, page, plan)
+    say(
+        f"{page}: {route.reached} of {route.views} views within reach, {100 * route.coverage:.0f} % of the "
+        f"upper hemisphere seen, rotations up to {route.rotation_spread_deg:.0f} deg, about "
+        f"{route.duration_s:.0f} s; nothing has moved"
+    )
 
 
 @contextmanager

@@ -1,22 +1,28 @@
 """Views of boards and objects, and the arm's way to them, in the simulated lab's layout."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from acquisition.kinematics import JOINT_LIMIT, forward, link_transforms
 from acquisition.clearance import CarriedCamera, is_clear
-from acquisition.planning import VIA, configurations, plan_path, plan_stills
+from acquisition.kinematics import JOINT_LIMIT, forward, link_transforms, unwrap_near
+from acquisition.planning import VIA, configurations, most_diverse, plan_path, plan_stills, shorten
 from acquisition.simulation.arm import HOME
 from acquisition.trajectories import (
+    board_visibility,
     hand_eye_views,
     hemisphere_path,
     hemisphere_views,
     look_at,
     rotation_spread_deg,
+    seen_cells,
 )
 from dataset.errors import ToolkitError
 from dataset.intrinsics import Intrinsics
 from dataset.transforms import SE3, rotation_error_deg, translation_error_mm
+from dataset.view_sphere import ViewSphere
 
 INTRINSICS = Intrinsics(
     np.array([[1740.0, 0, 1223.5], [0, 1740, 1023.5], [0, 0, 1]]), np.zeros(0), 2048, 2448
@@ -109,12 +115,68 @@ def test_plan_of_hand_eye_stills_is_diverse_reachable_and_clear() -> None:
     assert link_transforms(between)[:, 2:, 2, 3].min() > 0.05
 
 
-def test_plan_of_stills_prefers_short_motions() -> None:
-    views = hand_eye_views(T_BASE_BOARD, BOARD_SIZE, INTRINSICS, 40, seed=1)
+def travel(q: np.ndarray) -> float:
+    """Of the fastest joint, radians, from HOME through configurations (K, 6)."""
+    return float(np.abs(np.diff(np.vstack([HOME, q]), axis=0)).max(axis=1).sum())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_order_of_stills_keeps_motions_short(seed: int) -> None:
+    views = hand_eye_views(T_BASE_BOARD, BOARD_SIZE, INTRINSICS, 40, seed=seed)
     plan = plan_stills(views, CAMERA, HOME)
-    steps = np.abs(np.diff(plan.q, axis=0)).max(axis=1)
-    shuffled = np.random.default_rng(0).permutation(plan.q)
-    assert steps.mean() < 0.6 * np.abs(np.diff(shuffled, axis=0)).max(axis=1).mean()
+    here, as_wished = np.array(HOME), []
+    for candidates in configurations(views, CAMERA)[
+        np.sort(plan.index), 0
+    ]:  # each the nearest to the one before
+        near = unwrap_near(candidates, here)
+        here = near[np.nanargmin(np.abs(near - here).max(axis=1))]
+        as_wished.append(here)
+    assert travel(plan.q) < 0.5 * travel(np.array(as_wished))
+    between = [np.linspace(a, b, 30) for a, b in pairwise([np.array(HOME), *plan.q])]
+    assert is_clear(np.concatenate(between)[1:], CAMERA).all()
+
+
+def test_turning_round_a_part_of_the_way_shortens_it() -> None:
+    detour = [np.add(HOME, [turn, 0, 0, 0, 0, 0]) for turn in (0.1, 0.4, 0.3, 0.2, 0.5)]
+    assert shorten(np.array(HOME), detour, CAMERA) == [0, 3, 2, 1, 4]
+
+
+def test_stills_are_chosen_for_useful_rotations_and_for_what_they_show() -> None:
+    views = hand_eye_views(T_BASE_BOARD, BOARD_SIZE, INTRINSICS, 80, seed=2)
+    shown = board_visibility(views, T_BASE_BOARD, BOARD_SIZE, INTRINSICS)
+    chosen = most_diverse(views, 15, shown)
+    rng = np.random.default_rng(0)
+    drawn = [rng.choice(80, 15, replace=False) for _ in range(20)]
+    assert least_useful(views[chosen]) > 2 * np.median([least_useful(views[d]) for d in drawn])
+    assert shown[chosen].mean() > shown.mean()  # the sides of a choice by rotation alone are left out
+    assert len(set(chosen.tolist())) == 15
+
+
+def least_useful(poses: SE3) -> float:
+    """Of all pairs of poses, the smallest sine of the rotation between them."""
+    angle = np.deg2rad(rotation_error_deg(poses[:, None], poses[None]))
+    return float(np.sin(angle)[np.triu_indices(len(poses), 1)].min())
+
+
+def test_visibility_is_the_share_of_the_board_in_the_image() -> None:
+    above = look_at(np.add(BOARD_CENTRE, [0, 0, 0.5]), BOARD_CENTRE)
+    aside = look_at(np.add(BOARD_CENTRE, [0.16, 0, 0.5]), np.add(BOARD_CENTRE, [0.35, 0, 0]))
+    away = look_at(np.add(BOARD_CENTRE, [0, 0, 0.5]), np.add(BOARD_CENTRE, [0, 0, 1.0]))
+    shown = board_visibility(SE3.stack([above, aside, away]), T_BASE_BOARD, BOARD_SIZE, INTRINSICS)
+    assert shown[0] == 1.0
+    assert 0.1 < shown[1] < 0.9
+    assert shown[2] == 0.0
+    assert board_visibility(above, T_BASE_BOARD, BOARD_SIZE, INTRINSICS) == 1.0
+
+
+def test_coverage_counts_the_cells_that_were_looked_from() -> None:
+    sphere = ViewSphere(15.0)
+    zone = np.rad2deg(np.arcsin(sphere.directions[:, 2])) > 30
+    seen = seen_cells(hemisphere_views(OBJECT, (0.3, 0.5), (30, 90), 600), OBJECT, sphere)
+    assert seen[zone].all()
+    assert not seen[np.rad2deg(np.arcsin(sphere.directions[:, 2])) < 20].any()
+    one = seen_cells(look_at([np.add(OBJECT, [0, 0.1, 0.4])], OBJECT), OBJECT, sphere)
+    assert one.sum() == 1
 
 
 def test_path_over_the_hemisphere_is_dense_and_continuous() -> None:
@@ -141,6 +203,26 @@ def test_configurations_are_of_the_view_asked_for() -> None:
         reached = T_base_cam(solutions[np.isfinite(solutions).all(axis=-1)])
         assert (translation_error_mm(reached, view) < 1e-3).all()
     assert np.isfinite(q).all(axis=-1).any(axis=(1, 2)).sum() >= 3
+
+
+def test_a_long_tool_must_stay_clear_too() -> None:
+    low = np.deg2rad([180, -62, 100, -128, -90, 0])
+    short = CarriedCamera(SE3.identity(), SE3.identity())
+    long = CarriedCamera(SE3.from_rotvec([0, 0, 0], [0, 0, 0.3]), SE3.from_rotvec([0, 0, 0], [0, 0, -0.3]))
+    assert is_clear(low, short)
+    assert forward(low).translation[2] < 0.35
+    assert not is_clear(low, long)
+
+
+def test_a_plan_stays_in_the_workspace() -> None:
+    boxed = replace(CAMERA, workspace=((0.2, -0.6, 0.1), (0.9, 0.6, 0.55)))
+    views = hemisphere_path(OBJECT, (0.38, 0.38), (30, 80), rows=2, step_deg=15)
+    free, plan = plan_path(views, CAMERA, HOME), plan_path(views, boxed, HOME)
+    way = np.concatenate([np.linspace(a, b, 10) for a, b in pairwise(plan.q)])
+    tool = forward(way).translation
+    assert (tool >= np.array(boxed.workspace[0]) - 5e-3).all()  # between the points that were looked at
+    assert (tool <= np.array(boxed.workspace[1]) + 5e-3).all()
+    assert len(plan.unreachable) > len(free.unreachable)
 
 
 @pytest.mark.parametrize(

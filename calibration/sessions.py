@@ -206,8 +206,8 @@ def camera_poses(session: Session, calibration: Calibration) -> CameraPoses:
     offset_s, offset_sigma_s = (0.0, 0.0) if offset is None else (offset.offset_s, offset.sigma_s)
     times_ns, trace = arm_trace(session)
     origin = int(times_ns[0])
-    times = (times_ns - origin) * 1e-9
-    at = (session.mid_exposure_host_ns - origin) * 1e-9 + offset_s
+    times = np.asarray((times_ns - origin) * 1e-9, np.float64)
+    at = np.asarray((session.mid_exposure_host_ns - origin) * 1e-9 + offset_s, np.float64)
     known = (at >= times[0]) & (at <= times[-1]) & (_hole_around(times, at) < _longest_hole_s(times))
     T_base_cam = interpolate_poses(times, trace, np.clip(at, times[0], times[-1])) @ hand_eye.T_tcp_cam
     before = interpolate_poses(times, trace, np.clip(at - _SLOPE_SPAN_S, times[0], times[-1]))

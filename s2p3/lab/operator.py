@@ -32,7 +32,7 @@ from s2p3.lab.truth import NOMINAL_OBJECT_CENTRE, LabTruth
 _CANDIDATES = 600
 _HOLD_S = 0.9
 """How long the tip rests on a point; the recorder wants 0.6 s."""
-_PIVOT_POINT = (NOMINAL_OBJECT_CENTRE[0], 0.0, 0.06)
+PIVOT_POINT = (NOMINAL_OBJECT_CENTRE[0], 0.0, 0.06)
 """A punched hole on a block between board and object."""
 _RETREAT_M = 0.04
 _NORMAL_WEIGHT = 0.25
@@ -103,9 +103,9 @@ def pivot(truth: LabTruth, rig: Rig) -> Generator[int, None, None]:
     rng = np.random.default_rng(truth.seed + 4)
     with UrRobot(_by_hand(rig)) as arm:
         held, q = 0, arm.sample().q
-        for tilt in _tilts(rng):
+        for tilt in tilts(rng):
             slip = rng.normal(0, truth.pivot_noise_m, 3)
-            q_next = arm.inverse_kinematics(SE3(tilt, np.array(_PIVOT_POINT) + slip) @ T_tip_tcp, q)
+            q_next = arm.inverse_kinematics(SE3(tilt, np.array(PIVOT_POINT) + slip) @ T_tip_tcp, q)
             if q_next is None or np.abs(q_next - q).max() > np.pi:
                 continue
             arm.follow(q_next[None])
@@ -114,7 +114,7 @@ def pivot(truth: LabTruth, rig: Rig) -> Generator[int, None, None]:
             yield held
 
 
-def _tilts(rng: np.random.Generator) -> Iterator[NDArray[np.float64]]:
+def tilts(rng: np.random.Generator) -> Iterator[NDArray[np.float64]]:
     """Rotations of a tool that points down, tilted to all sides in turn and turned about itself, for ever."""
     down = np.diag([1.0, -1.0, -1.0])
     for index in count():
@@ -138,8 +138,8 @@ def touch(truth: LabTruth, rig: Rig) -> Generator[int, None, None]:
         touched = 0
         while True:
             before = touched
-            for point, normal in _contacts(truth, _CANDIDATES):
-                contact = _tip_pose(point, normal) @ T_tip_tcp
+            for point, normal in contacts(truth, _CANDIDATES):
+                contact = tip_pose(point, normal) @ T_tip_tcp
                 retreat = SE3(contact.rotation, contact.translation - _RETREAT_M * contact.rotation[:, 2])
                 q_contact = arm.inverse_kinematics(contact, q)
                 q_retreat = None if q_contact is None else arm.inverse_kinematics(retreat, q_contact)
@@ -155,7 +155,7 @@ def touch(truth: LabTruth, rig: Rig) -> Generator[int, None, None]:
                 raise ToolkitError("the operator reaches no point of the object; try another --seed")
 
 
-def _contacts(truth: LabTruth, candidates: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def contacts(truth: LabTruth, candidates: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Points and outward normals in the base frame that a tip from above can reach, each far from those
     before it: a person feels for the handle as well as for the wall."""
     rng = np.random.default_rng(truth.seed + 3)
@@ -193,7 +193,7 @@ def _faces_outwards(
     return (np.einsum("ij,ij->i", away[:, :2], normals[:, :2]) > 0) | (normals[:, 2] > 0.8)
 
 
-def _tip_pose(point: NDArray[np.float64], normal: NDArray[np.float64]) -> SE3:
+def tip_pose(point: NDArray[np.float64], normal: NDArray[np.float64]) -> SE3:
     """The tip at a point, its axis mostly downwards and a little against the surface."""
     axis = np.array([0.0, 0.0, -1.0]) - 0.35 * normal
     z = axis / np.linalg.norm(axis)

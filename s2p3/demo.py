@@ -25,6 +25,7 @@ from acquisition.capture import (
     capture_tool_tip,
     capture_touches,
 )
+from acquisition.recorder import Progress as Recorded
 from acquisition.rig import Rig
 from calibration import BoardSpec, Calibration
 from calibration.steps import add_hand_eye, add_intrinsics, add_time_offset
@@ -34,11 +35,11 @@ from dataset.splits import split_session
 from s2p3 import objects
 from s2p3.annotation import annotate
 from s2p3.commands.capture import recording
-from s2p3.commands.output import counting
+from s2p3.commands.output import counting, say
 from s2p3.config import PRESETS
 from s2p3.demo_report import compare, write_report
 from s2p3.evaluation import Evaluation
-from s2p3.lab import LabTruth, Operator, found_lab, running_lab
+from s2p3.lab import LabTruth, Operator, RunningLab, found_lab, running_lab
 from s2p3.lab.scene import board_spec
 from s2p3.learning import adapt, evaluate_split
 from s2p3.side_by_side import Training, run_side_by_side
@@ -143,7 +144,7 @@ class Demo:
         # Two threads of one process fight as soon as anything else runs; one each is as fast on two cores.
         torch.set_num_threads(1)
         self._devices = ExitStack()
-        self._serving = False
+        self._lab: RunningLab | None = None
 
     def __enter__(self) -> Demo:
         return self
@@ -170,11 +171,13 @@ class Demo:
     def film_board(self) -> None:
         self._open_lab()
         with recording("stills") as report:
-            views = self.plan.board_views
-            capture_board(self.rig, self._fresh(self.board), views=views, seed=self.seed, on_progress=report)
+            views, out = self.plan.board_views, self._fresh(self.board)
+            done = capture_board(self.rig, out, views=views, seed=self.seed, on_progress=report)
+        self._warn(done)
         with recording("in motion") as report:
-            seconds = self.plan.motion_s
-            capture_board_motion(self.rig, self._fresh(self.motion), seconds=seconds, on_progress=report)
+            seconds, out = self.plan.motion_s, self._fresh(self.motion)
+            done = capture_board_motion(self.rig, out, seconds=seconds, on_progress=report)
+        self._warn(done)
 
     def calibrate_camera(self) -> None:
         with counting("detect the board") as report:
@@ -205,8 +208,9 @@ class Demo:
     def film_object(self) -> None:
         self._open_lab()
         with recording("frames") as report:
-            seconds = self.plan.sequence_s
-            capture_sequence(self.rig, self._fresh(self.sequence), seconds=seconds, on_progress=report)
+            seconds, out = self.plan.sequence_s, self._fresh(self.sequence)
+            done = capture_sequence(self.rig, out, seconds=seconds, on_progress=report)
+        self._warn(done)
         self._close_lab()
 
     def annotate(self) -> None:
@@ -261,13 +265,18 @@ class Demo:
 
     def _open_lab(self) -> None:
         """Camera and arm serve until the last recording is made."""
-        if not self._serving:
-            self._devices.enter_context(running_lab(self._truth, self.rig))
-            self._serving = True
+        if self._lab is None:
+            self._lab = self._devices.enter_context(running_lab(self._truth, self.rig))
 
     def _close_lab(self) -> None:
         self._devices.close()
-        self._serving = False
+        self._lab = None
+
+    def _warn(self, done: Recorded) -> None:
+        """Says what is doubtful about a recording, and about the simulation that it was made of."""
+        simulated = () if self._lab is None else self._lab.warnings()
+        for warning in (*done.warnings, *simulated):
+            say(f"warning: {warning}")
 
     @property
     def _spec(self) -> BoardSpec:

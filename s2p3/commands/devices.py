@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import threading
+import time
 from pathlib import Path
 
 from rich.markup import escape
 
 from s2p3.commands.arguments import ObjectName, OptionalPath
 from s2p3.commands.output import console, say, show
+
+_LOOK_S = 10.0
 
 
 def doctor(*, rig: OptionalPath = None, json: bool = False) -> None:
@@ -66,10 +68,13 @@ def simulate(
     given = None if rig is None else Rig.load(rig)
     truth, rig_path = found_lab(lab, object, seed)
     devices = given or Rig.load(rig_path)
-    with running_lab(truth, devices):
+    with running_lab(truth, devices) as running:
         say(
             f"camera PHX050S-Q at {devices.camera.address} (GigE Vision), UR5e at {devices.robot.host} (RTDE)"
         )
         say(f"try: arv-tool-0.8, or s2p3 doctor --rig {rig or rig_path}; Ctrl-C ends both")
         with contextlib.suppress(KeyboardInterrupt):
-            threading.Event().wait()
+            while True:
+                time.sleep(_LOOK_S)
+                for warning in running.warnings():
+                    say(f"warning: {warning}")

@@ -2,7 +2,7 @@
 
 from s2p3.lab.founding import found_lab
 from s2p3.lab.operator import Operator
-from s2p3.lab.processes import running_lab
+from s2p3.lab.processes import RunningLab, running_lab
 from s2p3.lab.truth import LabTruth
 
-__all__ = ["LabTruth", "Operator", "found_lab", "running_lab"]
+__all__ = ["LabTruth", "Operator", "RunningLab", "found_lab", "running_lab"]

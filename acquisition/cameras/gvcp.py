@@ -36,39 +36,13 @@ def probe(address: str) -> Presence:
 
     Raises DeviceError, saying what to check, when no camera answers.
     """
-    try:
-        ip = socket.getaddrinfo(address, PORT, socket.AF_INET, socket.SOCK_DGRAM)[0][4][0]
-    except OSError as error:
-        raise DeviceError(
-            f"the camera's address '{address}' is neither an IPv4 address nor a known host name; correct "
-            "`address` under [camera] in the rig file"
-        ) from error
-    refused = False
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
-        try:
-            link.connect((ip, PORT))
-            for request_id in range(1, _TRIES + 1):
-                try:
-                    return Presence(str(ip), _read_privilege(link, request_id) & _EXCLUSIVE_OR_CONTROL != 0)
-                except ConnectionRefusedError:
-                    refused = True
-                    time.sleep(_WAIT_S / 2)
-                except TimeoutError:
-                    refused = False
-        except OSError as error:
-            raise DeviceError(
-                f"no way to the camera at {address} ({error.strerror}); check that this computer's network "
-                "card is up and has an address in the camera's subnet"
-            ) from error
-    if refused:
-        raise DeviceError(
-            f"{address} answers, but no camera listens there on UDP port {PORT}; check the address, and that "
-            "the camera (or the simulated one) is running"
-        )
-    raise DeviceError(
-        f"no camera answers at {address} (UDP port {PORT}); check the address (arv-tool-0.8 lists cameras), "
-        "power and cable, that this computer is in the same subnet, and that the firewall lets UDP through"
-    )
+    ip, privilege = _read(address, _CONTROL_PRIVILEGE)
+    return Presence(ip, privilege & _EXCLUSIVE_OR_CONTROL != 0)
+
+
+def read_register(address: str, register: int) -> int:
+    """A 32-bit register of a camera, as anybody may read it. Raises like `probe`."""
+    return _read(address, register)[1]
 
 
 def path_mtu(ip: str) -> int:
@@ -96,9 +70,46 @@ def wait_for_control(address: str) -> Presence:
     return presence
 
 
-def _read_privilege(link: socket.socket, request_id: int) -> int:
-    """The control channel privilege register. Raises TimeoutError without an answer."""
-    link.send(struct.pack(">BBHHHI", _KEY, _ACKNOWLEDGE, _READREG, 4, request_id, _CONTROL_PRIVILEGE))
+def _read(address: str, register: int) -> tuple[str, int]:
+    """The camera's IPv4 address, and what its register holds."""
+    try:
+        ip = socket.getaddrinfo(address, PORT, socket.AF_INET, socket.SOCK_DGRAM)[0][4][0]
+    except OSError as error:
+        raise DeviceError(
+            f"the camera's address '{address}' is neither an IPv4 address nor a known host name; correct "
+            "`address` under [camera] in the rig file"
+        ) from error
+    refused = False
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        try:
+            link.connect((ip, PORT))
+            for request_id in range(1, _TRIES + 1):
+                try:
+                    return str(ip), _exchange(link, register, request_id)
+                except ConnectionRefusedError:
+                    refused = True
+                    time.sleep(_WAIT_S / 2)
+                except TimeoutError:
+                    refused = False
+        except OSError as error:
+            raise DeviceError(
+                f"no way to the camera at {address} ({error.strerror}); check that this computer's network "
+                "card is up and has an address in the camera's subnet"
+            ) from error
+    if refused:
+        raise DeviceError(
+            f"{address} answers, but no camera listens there on UDP port {PORT}; check the address, and that "
+            "the camera (or the simulated one) is running"
+        )
+    raise DeviceError(
+        f"no camera answers at {address} (UDP port {PORT}); check the address (arv-tool-0.8 lists cameras), "
+        "power and cable, that this computer is in the same subnet, and that the firewall lets UDP through"
+    )
+
+
+def _exchange(link: socket.socket, register: int, request_id: int) -> int:
+    """Reads one register. Raises TimeoutError without an answer."""
+    link.send(struct.pack(">BBHHHI", _KEY, _ACKNOWLEDGE, _READREG, 4, request_id, register))
     deadline = time.monotonic() + _WAIT_S
     while (remaining_s := deadline - time.monotonic()) > 0:
         link.settimeout(remaining_s)

@@ -4,8 +4,8 @@ Run as ``python -m acquisition.simulation.camera``; from Python, `SimulatedCamer
 ``clock`` answers the origin (host monotonic ns) and drift (ppm) of the camera's clock, ``statistics`` the
 frames sent and how many of them late. Faults: ``lost-ratio X`` of the packets, ``latency-s X`` of the frames,
 ``clock-jump S`` seconds forward (or back), ``stall S`` seconds in which it neither sends nor answers,
-``stuck-auto yes`` for an exposure that stays automatic, ``ptp-master yes`` for a network with a master clock.
-Any other command goes to the source.
+``stuck-auto yes`` for an exposure that stays automatic, ``payload-padding N`` for frames of another geometry,
+``ptp-master yes`` for a network with a master clock. Any other command goes to the source.
 """
 
 from __future__ import annotations
@@ -205,6 +205,7 @@ def _serve(options: argparse.Namespace) -> None:
         "stall": set_on_sensor("stall_s"),
         "clock-jump": lambda value: jump(float(value)),
         "stuck-auto": lambda value: device.stick_exposure_auto(_yes(value)),
+        "payload-padding": lambda value: device.pad_payload(int(value)),
         "ptp-master": lambda value: device.set_ptp_master(_yes(value)),
     }
 

@@ -37,6 +37,7 @@ _ACQUISITION, _STARTED, _IN_STEP = 0x124, 1, 2
 # Ours, as genicam.xml has them.
 _EXPOSURE_AUTO, _BALANCE_WHITE_AUTO, _AUTO_CONTINUOUS = 0xA000, 0xA018, 2
 _PTP_ENABLE, _PTP_MASTER, _GAMMA_ENABLE, _EXPOSURE_AUTO_STUCK = 0xA00C, 0xA020, 0xA014, 0xA01C
+_PAYLOAD_PADDING = 0xA024
 
 # The device answers nobody while it waits for its beat.
 _LONGEST_WAIT_US = 250_000
@@ -145,6 +146,10 @@ class FakeDevice:
     def stick_exposure_auto(self, stuck: bool) -> None:
         """Whether automatic exposure stays on, whatever a client writes."""
         self._camera.write_register(_EXPOSURE_AUTO_STUCK, int(stuck))
+
+    def pad_payload(self, size: int) -> None:
+        """Announces frames larger than they are by so many bytes."""
+        self._camera.write_register(_PAYLOAD_PADDING, size)
 
     def close(self) -> None:
         """Ends the device's thread and frees its port."""

@@ -147,19 +147,21 @@ def test_settings_out_of_range_are_refused_with_the_range(simulated_camera: Simu
 
 
 @pytest.mark.skipif(shutil.which("arv-tool-0.8") is None, reason="needs Debian's aravis-tools-cli")
-def test_a_camera_left_with_a_region_and_automatic_exposure_is_set_right(
+def test_a_camera_left_automatic_cropped_mirrored_and_bent_is_set_right(
     simulated_camera: SimulatedCamera,
 ) -> None:
     def control(*features: str) -> str:
         command = ["arv-tool-0.8", "-a", ADDRESS, "control", *features]
         return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout
 
-    control("Width=64", "OffsetX=32", "ExposureAuto=Continuous", "GainAuto=Continuous")
+    control("Width=64", "OffsetX=32", "ReverseX=1", "GammaEnable=1")
+    control("ExposureAuto=Continuous", "GainAuto=Continuous", "BalanceWhiteAuto=Continuous")
     with AravisCamera(CameraConfig(ADDRESS)) as camera:
         assert (camera.info.width, camera.info.height) == (256, 192)
-    after = control("OffsetX", "ExposureAuto", "GainAuto")
+    after = control("OffsetX", "ExposureAuto", "GainAuto", "BalanceWhiteAuto", "ReverseX", "GammaEnable")
     assert "OffsetX = 0" in after
-    assert after.count("= Off") == 2
+    assert after.count("= Off") == 3
+    assert after.count("= false") == 2
 
 
 def test_second_client_is_told_why(simulated_camera: SimulatedCamera) -> None:

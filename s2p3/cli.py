@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 
 from dataset.errors import ToolkitError
-from s2p3.commands import calibrate, capture, console, demo, devices, learn, sessions
+from s2p3.commands import calibrate, capture, console, demo, devices, exchange, learn, sessions
 
 Verb = Callable[..., Any]
 
@@ -35,6 +35,8 @@ VERBS: dict[str, Verb | Group] = {
             "hand-eye": capture.hand_eye,
             "board-motion": capture.board_motion,
             "tool-tip": capture.tool_tip,
+            "touches": capture.touches,
+            "polarizer": capture.polarizer,
             "sequence": capture.sequence,
         },
     ),
@@ -46,17 +48,24 @@ VERBS: dict[str, Verb | Group] = {
             "intrinsics": calibrate.intrinsics,
             "hand-eye": calibrate.hand_eye,
             "time-offset": calibrate.time_offset,
+            "tool-tip": calibrate.tool_tip,
+            "polarizer": calibrate.polarizer,
             "object": calibrate.object_pose,
         },
     ),
     "annotate": sessions.annotate,
     "dataset": Group(
-        "Look into session files, check, repair and split them",
+        "Look into session files, check, repair, divide and join them, and exchange them with other formats",
         {
             "info": sessions.info,
             "validate": sessions.validate,
             "repair": sessions.repair,
             "split": sessions.split,
+            "subset": exchange.subset,
+            "merge": exchange.merge,
+            "convert": exchange.convert,
+            "export-bop": exchange.export_bop,
+            "import": exchange.import_,
             "view": console.view,
         },
     ),

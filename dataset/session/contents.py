@@ -40,7 +40,8 @@ class Contents:
     def names(self, group: str) -> tuple[str, ...]:
         """The members of a group; none where it is absent."""
         with reading(self.path):
-            return tuple(self._open_file().get(group, ()))
+            file = self._open_file()
+            return tuple(file[group]) if group in file else ()
 
     def attribute(self, group: str, name: str) -> Any:
         """An attribute as a plain Python value; None where it is absent.
@@ -75,13 +76,13 @@ class Contents:
         return data
 
     def image(self, path: str, checksums: str, index: int) -> Any:
-        """One image of a dataset of images, held against its checksum.
+        """One image of a dataset of images, held against its checksum (masks of schema 1.0 have none).
 
         Raises:
             SessionError: absent or damaged.
         """
         image = self.read(path, index)
-        if checksum(image) != int(self.read(checksums, index)):
+        if self.has(checksums) and checksum(image) != int(self.read(checksums, index)):
             raise _damaged(self.path, f"{path}[{index}]")
         return image
 
@@ -95,7 +96,7 @@ class Contents:
 
     def _dataset(self, path: str) -> h5py.Dataset:
         with reading(self.path):
-            found = self._open_file().get(path)
+            found = self._open_file()[path] if self.has(path) else None  # `get` hides damage
         if not isinstance(found, h5py.Dataset):
             raise SessionError(f"{self.path} lacks {path}; see: s2p3 dataset validate {self.path}")
         return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import h5py
@@ -142,6 +142,41 @@ def write_split(path: str | Path, name: str, indices: ArrayLike) -> None:
         if f"splits/{name}" in file:
             del file[f"splits/{name}"]
         make_dataset(file, declaration("splits/*"), f"splits/{name}", chosen, chosen.shape, np.int64)
+
+
+def write_origin(path: str | Path, origin: str) -> None:
+    """Notes what a session was made from, where it is no recording of its own.
+
+    Raises:
+        SessionError: the file cannot be edited.
+    """
+    with open_for_editing(Path(path)) as file:
+        file.attrs["origin"] = origin
+        leave_open(file)
+
+
+def write_depth(path: str | Path, images: Sequence[NDArray[np.uint16]]) -> None:
+    """Stores the depth of every frame, replacing an earlier one.
+
+    Args:
+        path: of a complete session with N frames.
+        images: N of them, (h, w) uint16, millimetres, 0: unknown, in the undistorted polarization image.
+
+    Raises:
+        SessionError: the file cannot be edited, or the images do not fit its frames.
+    """
+    path = Path(path)
+    with open_for_editing(path) as file:
+        block = SUPERPIXEL[file["camera"].attrs["mosaic"]]
+        height, width = _mosaic_size(file)
+        shape = (len(file["camera/raw"]), height // block, width // block)
+        _require(path, "depth", (len(images), *shape[1:]), shape)
+        for index, image in enumerate(images):
+            _require(path, f"depth {index}", image.shape, shape[1:])
+        for name in ("depth", "depth_crc32"):
+            if name in file:
+                del file[name]
+        store_images(file, declaration("depth"), images, shape, np.uint16)
 
 
 def store_intrinsics(file: h5py.File, intrinsics: Intrinsics) -> None:

@@ -162,9 +162,15 @@ def check_format(path: Path, file: h5py.File) -> None:
     major = version.split(".")[0]
     if not major.isdigit():
         raise SessionError(f"{path}: the schema version {version!r} is not MAJOR.MINOR; the file is damaged")
+    if int(major) < MAJOR:
+        raise SessionError(
+            f"{path} has schema {version}, this toolkit reads {MAJOR}.x; bring it up with: "
+            f"s2p3 dataset convert {path}"
+        )
     if int(major) > MAJOR:
         raise SessionError(
-            f"{path} has schema {version}, this toolkit reads up to {VERSION}; upgrade the toolkit to open it"
+            f"{path} has schema {version}, this toolkit reads up to {VERSION}; upgrade the toolkit, whose "
+            f"`s2p3 dataset convert` also brings sessions of schema {MAJOR}.x to {major}.x"
         )
 
 

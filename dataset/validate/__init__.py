@@ -13,6 +13,7 @@ from dataset.validate.summary import SessionInfo, info
 __all__ = ["Problem", "RepairResult", "SessionInfo", "info", "repair", "validate"]
 
 _CHECKS = (
+    structure.check_reachable,
     structure.check_attributes,
     structure.check_datasets,
     structure.check_seals,

@@ -16,14 +16,20 @@ from dataset.session.seals import SEAL, intact
 Indices = NDArray[np.int64]
 
 
-def copy_content(source: h5py.File, target: h5py.File, keep: Indices, damaged: Indices) -> tuple[str, ...]:
+def copy_content(
+    source: h5py.File,
+    target: h5py.File,
+    keep: Indices,
+    gone: Indices,
+    reason: bytes = b"damaged in the file",
+) -> tuple[str, ...]:
     """Copies a session with only some of its frames.
 
     Args:
         source: open for reading, perhaps damaged.
         target: open for writing, empty.
         keep: frames to copy; everything that has one row a frame is cut to these, splits are renumbered.
-        damaged: frames to enter in the ledger instead.
+        gone: frames to enter in the ledger instead, with the `reason`.
 
     Returns:
         Paths that could not be read and are left out.
@@ -38,7 +44,7 @@ def copy_content(source: h5py.File, target: h5py.File, keep: Indices, damaged: I
         declared = declared_at(path)
         try:
             if path == "camera/drops":
-                _copy_drops(source, target, damaged)
+                _copy_drops(source, target, gone, reason)
             elif declared is not None and declared.compressed:
                 _copy_images(node, target, declared, path, keep)
             elif declared is not None:
@@ -100,10 +106,10 @@ def _copy_images(node: h5py.Dataset, target: h5py.File, declared: Dataset, path:
         stored.id.write_direct_chunk((row, 0, 0), compress(node[int(index)]).data)
 
 
-def _copy_drops(source: h5py.File, target: h5py.File, damaged: Indices) -> None:
+def _copy_drops(source: h5py.File, target: h5py.File, gone: Indices, reason: bytes) -> None:
     declared = declaration("camera/drops")
     ids, times = source["camera/frame_id"], source["camera/host_time_ns"]
-    rows = [(int(ids[int(i)]), b"damaged in the file", int(times[int(i)])) for i in damaged]
+    rows = [(int(ids[int(i)]), reason, int(times[int(i)])) for i in gone]
     ledger = np.concatenate([source["camera/drops"][:], np.array(rows, dtype=DROP_DTYPE)])
     make_dataset(target, declared, declared.path, ledger, ledger.shape, ledger.dtype)
 

@@ -16,6 +16,23 @@ from dataset.validate.problems import Problem, View, instances
 _RERECORD = "the file was not written by this toolkit, or was changed since; record or import it again"
 
 
+def check_reachable(view: View) -> Iterator[Problem]:
+    """Everything that the table of contents names can be opened."""
+
+    def inside(group: h5py.Group, prefix: str) -> Iterator[Problem]:
+        for name in group:
+            try:
+                node = group[name]
+            except READ_ERRORS as error:
+                hint = "copy the file again from its source"
+                yield Problem(prefix + name, f"cannot be opened ({error})", hint)
+                continue
+            if isinstance(node, h5py.Group):
+                yield from inside(node, f"{prefix}{name}/")
+
+    return inside(view.file, "")
+
+
 def check_attributes(view: View) -> Iterator[Problem]:
     """Every declared attribute is there, has its type, and holds an allowed value."""
     for declared in ATTRIBUTES:

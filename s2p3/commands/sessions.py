@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -51,19 +52,24 @@ def info(session: tyro.conf.Positional[Path], *, json: bool = False) -> None:
     show(asdict(summarise(session)), json)
 
 
-def validate(session: tyro.conf.Positional[Path], *, json: bool = False) -> None:
+def validate(session: tyro.conf.Positional[Path], *, undrawn: bool = False, json: bool = False) -> None:
     """Check a session and report every problem; exit code 2 when there is one.
 
     Args:
         session: the session file.
+        undrawn: leave out the slowest check, which holds every mask against the mesh drawn at its pose.
         json: print it as JSON.
     """
     from dataclasses import asdict
 
-    from dataset.errors import SessionError
+    from dataset.errors import SessionError, ToolkitError
     from dataset.validate import validate as find_problems
+    from s2p3.silhouettes import check_masks
 
     problems = find_problems(session)
+    if not undrawn:
+        with suppress(ToolkitError):  # what cannot be read has been reported above
+            problems.extend(check_masks(session))
     if json:
         show({"problems": [asdict(problem) for problem in problems]}, as_json=True)
     else:

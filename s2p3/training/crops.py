@@ -1,4 +1,5 @@
-"""From sessions to canonical crops in memory: read once, resampled thousands of times.
+"""From sessions to canonical crops: read once, kept in memory and resampled thousands of times. (Where the
+memory does not hold them, `loader` makes the same crops anew for every epoch.)
 
 Two kinds, kept apart by type. `Crops` holds what can be had of a captured frame without its pose: Stokes
 values in a predicted box, and the predicted mask. `LabelledCrops` adds the truth of a synthetic (or
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from dataset import SE3, Intrinsics
 from dataset.errors import ToolkitError
-from dataset.session import Session, mask_box
+from dataset.session import ObjectPoses, Session, mask_box
 from s2p3.config import InputConfig
 from s2p3.inputs import crop_intrinsics, extract_crop, square_box
 from s2p3.networks.detector import Detection
@@ -102,24 +103,55 @@ def labelled_crops(
             with Session.open(path) as session:
                 intrinsics = session.working_intrinsics
                 poses = session.object_poses(model.name)
+                shown = set(shown_frames(poses))
                 for index in range(len(session)):
                     mask = poses.mask(index)
-                    if poses.visible_fraction[index] >= _MINIMUM_VISIBLE and mask.any():
-                        stokes = session.stokes(index).stack()
-                        crop = _crop(stokes, mask, mask_box(mask), intrinsics, config, len(rows))
-                        rows.append(
-                            crop | _truth(crop["K"], mask, poses.T_cam_obj[index], intrinsics, model, config)
-                        )
+                    if index in shown and mask.any():
+                        stokes = np.moveaxis(session.stokes(index).stack(), 0, -1)
+                        pose = poses.T_cam_obj[index]
+                        rows.append(labelled_crop(stokes, mask, pose, intrinsics, model, config, len(rows)))
                     report(index + 1, len(session), {})
     if not rows:
         raise ToolkitError(
             f"{', '.join(map(str, paths))}: no frame shows {model.name!r}; annotate or synthesize first"
         )
-    tensors = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
+    crops = collate(rows)
     if stored is not None:
         stored.parent.mkdir(parents=True, exist_ok=True)
-        save_tensors(stored, tensors)
-    return LabelledCrops(**tensors)
+        save_tensors(stored, vars(crops))
+    return crops
+
+
+def shown_frames(poses: ObjectPoses) -> list[int]:
+    """Indices of the frames that show enough of an object to be trained on."""
+    return [int(index) for index in np.flatnonzero(poses.visible_fraction >= _MINIMUM_VISIBLE)]
+
+
+def labelled_crop(
+    stokes: NDArray[np.floating],
+    mask: NDArray[np.bool_],
+    T_cam_obj: SE3,
+    intrinsics: Intrinsics,
+    model: ObjectModel,
+    config: InputConfig,
+    frame: int,
+) -> dict[str, NDArray[np.generic]]:
+    """One row of `LabelledCrops`.
+
+    Args:
+        stokes: (H, W, 3) undistorted, or a memory map of it: only the part under the crop is read.
+        mask: (H, W), visible, not empty.
+        frame: what the row's `frames` says.
+    """
+    crop = _crop(stokes, mask, mask_box(mask), intrinsics, config, frame)
+    return crop | _truth(crop["K"], mask, T_cam_obj, intrinsics, model, config)
+
+
+def collate(rows: Sequence[dict[str, NDArray[np.generic]]]) -> LabelledCrops:
+    """Rows of `labelled_crop` as one batch."""
+    return LabelledCrops(
+        **{name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
+    )
 
 
 def captured_crops(
@@ -133,7 +165,7 @@ def captured_crops(
     """
     rows = [
         _crop(
-            session.stokes(index).stack(),
+            np.moveaxis(session.stokes(index).stack(), 0, -1),
             found.mask,
             found.box_xywh,
             session.working_intrinsics,
@@ -155,7 +187,7 @@ def single_crop(
     stokes: NDArray[np.float32], found: Detection, intrinsics: Intrinsics, config: InputConfig
 ) -> Crops:
     """The crop (N = 1) of one undistorted Stokes image (3, H, W) at a predicted box."""
-    row = _crop(stokes, found.mask, found.box_xywh, intrinsics, config, 0)
+    row = _crop(np.moveaxis(stokes, 0, -1), found.mask, found.box_xywh, intrinsics, config, 0)
     return Crops(**{name: torch.from_numpy(value[None]) for name, value in row.items()})
 
 
@@ -173,7 +205,7 @@ def canonical_pose(pose: SE3, symmetry: Symmetry) -> SE3:
 
 
 def _crop(
-    stokes: NDArray[np.float32],
+    stokes: NDArray[np.floating],
     mask: NDArray[np.bool_],
     box: NDArray[np.float64],
     intrinsics: Intrinsics,
@@ -181,14 +213,26 @@ def _crop(
     frame: int,
 ) -> dict[str, NDArray[np.generic]]:
     region = square_box(box, config.canonical_zoom)
-    image = np.concatenate([stokes, mask[None].astype(np.float32)])
-    crop = extract_crop(image, region, config.canonical_size).astype(np.float16)
+    rows, columns = _under(region, mask.shape)
+    part = np.dstack([stokes[rows, columns], mask[rows, columns]]).astype(np.float32)
+    local = region - [columns.start, rows.start, 0, 0]
+    crop = extract_crop(np.moveaxis(part, -1, 0), local, config.canonical_size).astype(np.float16)
     return {
         "stokes": crop[:3],
         "mask": crop[3:],
         "K": crop_intrinsics(intrinsics, region, config.canonical_size),
         "frames": np.array(frame, dtype=np.int64),
     }
+
+
+def _under(region: NDArray[np.float64], shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of an image that interpolation inside a region reads; at least one pixel."""
+    x, y, w, h = region
+    spans = []
+    for low, high, size in ((y, y + h, shape[0]), (x, x + w, shape[1])):
+        start = min(max(int(np.floor(low)) - 2, 0), size - 1)
+        spans.append(slice(start, max(min(int(np.ceil(high)) + 2, size), start + 1)))
+    return spans[0], spans[1]
 
 
 def _truth(

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from dataset import SE3, CameraInfo, ClockFit, Intrinsics, RawFrame, RobotTrace, SessionError
+from dataset.clocks import DeviceClock
 from dataset.polarimetry import decode
 from dataset.schema import DATASETS, VERSION
-from dataset.clocks import DeviceClock
 from dataset.session import (
     ObjectPoses,
     ObjectRecord,
@@ -349,7 +349,7 @@ def test_files_that_are_no_session_are_refused(tmp_path: Path, recorded: Path) -
         (tmp_path, "is a folder"),
         (text, "not an HDF5 file"),
         (foreign, "no session: its format attribute is None"),
-        (newer, "has schema 2.3, this toolkit reads up to 1.0"),
+        (newer, "has schema 2.3, this toolkit reads up to 1.1"),
         (truncated, "damaged or truncated"),
     ):
         with pytest.raises(SessionError, match=message) as caught:

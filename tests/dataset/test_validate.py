@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dataset import CameraInfo, Intrinsics, RawFrame
+from dataset.schema import VERSION
 from dataset.session import SessionWriter, compress, mask_box
 from dataset.validate import info, validate
 
@@ -204,7 +205,7 @@ def test_info_summarises(recorded: Path, camera: CameraInfo) -> None:
     assert summary.objects == summary.annotated == ("tetra",)
     assert summary.splits == {"train": 9, "test": 3}
     assert summary.size_bytes == recorded.stat().st_size
-    assert summary.schema == "1.0"
+    assert summary.schema == VERSION
 
 
 def test_unexplained_gaps_count_only_what_the_ledger_lacks(

@@ -1,0 +1,117 @@
+"""A folder of raw mosaics as a session."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dataset.errors import ToolkitError
+from dataset.frames import Mosaic
+from dataset.importers.target import Imported, Stamps, sensor, write_imported
+from dataset.polarimetry import Raw, white_level
+
+_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
+_INTEGERS, _NUMBERS = ("camera_time_ns", "host_time_ns"), ("exposure_us", "gain_db")
+
+
+def import_raw_folder(
+    folder: str | Path,
+    out: str | Path,
+    layout: Mosaic,
+    bits: int | None = None,
+    stamps: str | Path | None = None,
+) -> int:
+    """Writes the PNG, TIFF or npy mosaics of a folder, in the order of their names, as a session.
+
+    Args:
+        folder: of (H, W) mosaics, 8 or 16 bit.
+        out: of the session to be.
+        layout: "mono" for cells of 2x2 pixels, "colour" for super-pixels of 4x4.
+        bits: significant bits of a value; must be given for 16-bit files, which may hold 10, 12 or 16.
+        stamps: a CSV file with a column `file` (names in the folder) and any of camera_time_ns, host_time_ns,
+            exposure_us, gain_db; what it does not tell is stored as unknown.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        ToolkitError: no or unequal images, ambiguous or wrong bits, or a malformed CSV.
+        SessionError: the session exists.
+    """
+    folder = Path(folder)
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in _SUFFIXES)
+    if not files:
+        raise ToolkitError(
+            f"{folder} holds no {', '.join(_SUFFIXES)} file; name the folder of the raw mosaics"
+        )
+    first = _read(files[0])
+    if bits is None and first.dtype == np.uint16:
+        raise ToolkitError(f"{files[0]} has 16 bits, of which 10, 12 or all may count; give --bits")
+    depth = bits or 8
+    if not 1 <= depth <= 8 * first.dtype.itemsize:
+        raise ToolkitError(f"--bits {depth} does not fit {files[0]}, which holds {first.dtype}")
+
+    def mosaics() -> Iterator[Raw]:
+        for path in files:
+            pixels = _read(path)
+            if pixels.shape != first.shape or pixels.dtype != first.dtype:
+                raise ToolkitError(
+                    f"{path} is {pixels.shape} {pixels.dtype}, {files[0].name} is {first.shape} "
+                    f"{first.dtype}; import them separately"
+                )
+            if int(pixels.max()) > white_level(depth):
+                raise ToolkitError(f"{path} holds the value {pixels.max()}, more than --bits {depth} allow")
+            yield pixels
+
+    imported = Imported(
+        camera=sensor(layout, first.shape[0], first.shape[1], depth),
+        intrinsics=None,
+        frame_ids=np.arange(len(files)),
+        origin=f"raw mosaics of the folder {folder.resolve().name}",
+        stamps=None if stamps is None else _stamps(Path(stamps), [path.name for path in files]),
+    )
+    return write_imported(out, imported, mosaics())
+
+
+def _read(path: Path) -> Raw:
+    if path.suffix.lower() == ".npy":
+        try:
+            image = np.load(path, allow_pickle=False)
+        except (ValueError, OSError, EOFError) as error:
+            raise ToolkitError(
+                f"{path} is no plain numpy array ({error}); save it with numpy.save"
+            ) from error
+    else:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        found = "no image" if image is None else f"{image.shape} {image.dtype}"
+        raise ToolkitError(f"{path} is {found}; a raw mosaic is a grey image (H, W) of 8 or 16 bits")
+    return image
+
+
+def _stamps(path: Path, names: list[str]) -> Stamps:
+    known = ("file", *_INTEGERS, *_NUMBERS)
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+    except OSError as error:
+        raise ToolkitError(f"{path} cannot be read ({error.strerror}); check the path") from error
+    columns = set(rows[0]) if rows else set()
+    if "file" not in columns or not columns <= set(known):
+        raise ToolkitError(f"{path}: its first line must name columns among {', '.join(known)}, with file")
+    by_name = {row["file"]: row for row in rows}
+    if missing := [name for name in names if name not in by_name]:
+        raise ToolkitError(f"{path} has no row for {missing[0]}; add it, or remove the image")
+    stamps = Stamps.unknown(len(names))
+    found = {name: getattr(stamps, name) for name in known[1:]}
+    for name in columns - {"file"}:
+        try:
+            values = [by_name[file][name] for file in names]
+            found[name] = np.array([int(v) if name in _INTEGERS else float(v) for v in values])
+        except ValueError as error:
+            raise ToolkitError(f"{path}: the column {name} holds no number somewhere ({error})") from error
+    return Stamps(**found)

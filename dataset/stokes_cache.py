@@ -1,0 +1,81 @@
+"""The undistorted Stokes images of a session, decoded once: a memory-mapped array beside the file.
+
+The array `.NAME.stokes-HASH.npy` holds half-precision floats (N, h, w, 3) in the order S0, S1, S2: 11 bits of
+mantissa, and finer near zero, where S1 and S2 live, than the 12 bits of the sensor. The hash covers all that
+the images depend on, so that a session that was recalibrated or changed gets a new array and the old one
+goes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataset.errors import SessionError
+from dataset.session import Session
+
+_VERSION = 1
+"""Of the decoding and of this layout: raise it when either changes."""
+
+Progress = Callable[[int, int], None]
+
+
+def cached_stokes(path: str | Path, on_progress: Progress = lambda done, total: None) -> NDArray[np.float16]:
+    """(N, h, w, 3) read-only, memory-mapped Stokes images of a session; made on the first call.
+
+    Two processes that call it at once both make it, and the second result replaces the first, which is the
+    same. Reading from it needs no lock and works in any number of processes.
+
+    Raises:
+        SessionError: the session is not calibrated or damaged, or the disk has no room for the array.
+    """
+    path = Path(path)
+    with Session.open(path) as session:
+        target = cache_path(session)
+        if not target.exists():
+            _make(session, target, on_progress)
+    for stale in path.parent.glob(f".{path.name}.stokes-*.npy"):
+        if stale != target:
+            stale.unlink(missing_ok=True)
+    found: NDArray[np.float16] = np.load(target, mmap_mode="r", allow_pickle=False)
+    return found
+
+
+def cache_path(session: Session) -> Path:
+    """Where the array of a session is or would be."""
+    digest = hashlib.sha256(f"{_VERSION} {session.session_id} {astuple(session.camera)}".encode())
+    digest.update(session.contents.read("camera/crc32", slice(len(session))).tobytes())
+    camera, response = session.intrinsics, session.polarizer_response
+    parts: list[NDArray[Any]] = [] if camera is None else [camera.K, camera.distortion]
+    for part in parts if response is None else [*parts, response.analysis]:
+        digest.update(part.tobytes() + b"|")
+    return session.path.with_name(f".{session.path.name}.stokes-{digest.hexdigest()[:16]}.npy")
+
+
+def _make(session: Session, target: Path, on_progress: Progress) -> None:
+    height, width = session.camera.working_size
+    shape = (len(session), height, width, 3)
+    size = 2 * int(np.prod(shape))
+    if shutil.disk_usage(target.parent).free < size + (1 << 28):
+        raise SessionError(
+            f"{session.path}: its decoded images need {size / 1e9:.1f} GB beside it; make room, or copy the "
+            "session to a larger disk"
+        )
+    partial = target.with_suffix(f".{os.getpid()}.partial")
+    try:
+        array = np.lib.format.open_memmap(partial, mode="w+", dtype=np.float16, shape=shape)
+        for index in range(len(session)):
+            array[index] = np.moveaxis(session.stokes(index).stack(), 0, -1)
+            on_progress(index + 1, len(session))
+        array.flush()
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)

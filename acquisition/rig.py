@@ -45,7 +45,7 @@ class RobotTable(RobotConfig):
 
 @dataclass(frozen=True)
 class BoardTable:
-    """[board]: the ChArUco board used to calibrate. Measure the print: printers scale."""
+    """[board]: the board used to calibrate. Measure the print: printers scale."""
 
     squares_x: int = 11
     """Squares along the board's x axis."""
@@ -56,14 +56,18 @@ class BoardTable:
     marker_m: float = 0.026
     """Side of a marker, metres."""
     dictionary: str = "DICT_5X5_100"
-    """OpenCV's name of the ArUco dictionary."""
+    """OpenCV's name of the ArUco dictionary; unused by a chessboard."""
+    kind: Literal["charuco", "checkerboard", "aprilgrid"] = "charuco"
+    """`charuco`, `checkerboard` (seen whole only), or `aprilgrid`: squares are then cells with a tag each."""
 
     def __post_init__(self) -> None:
-        if min(self.squares_x, self.squares_y) < 3:
+        if min(self.squares_x, self.squares_y) < (2 if self.kind == "aprilgrid" else 3):
             raise ToolkitError(
                 f"squares_x and squares_y are {self.squares_x} and {self.squares_y}; a board needs at least "
                 "3 squares a side: count those of the print"
             )
+        if self.kind == "checkerboard" and 0 < self.square_m < 1:
+            return
         if not 0 < self.marker_m < self.square_m < 1:
             raise ToolkitError(
                 f"marker_m = {self.marker_m:g} and square_m = {self.square_m:g} must satisfy "

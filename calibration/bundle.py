@@ -212,8 +212,9 @@ class _Problem:
         shared_T = np.swapaxes(linear.by_shared, 1, 2) * information[:, None, None]
         residual = linear.residual[..., None]
         deviation = state.deviation
-        shared_pull = self.shared_information @ state.shared_deviation
-        shared_cost = float(state.shared_deviation @ shared_pull)
+        shared_deviation = state.shared_deviation
+        shared_pull = self.shared_information @ shared_deviation
+        shared_cost = float(shared_deviation @ shared_pull)
         return _Normal(
             cost=float(loss.sum() + np.sum(self.own_information * deviation**2)) + shared_cost,
             residual=linear.residual,

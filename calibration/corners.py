@@ -19,7 +19,7 @@ from calibration.board import BoardSpec
 
 _PARAMETERS = 9  # cx, cy, angle 1, angle 2, blur, offset, contrast, gradient x, gradient y
 _MAX_HALF_WINDOW_PX = 10
-_MAX_SHIFT_PX = 2.0
+_MAX_SHIFT_PX = 3.0
 
 
 def refine_corners(
@@ -28,21 +28,21 @@ def refine_corners(
     board_xy: NDArray[np.float64],
     homography: NDArray[np.float64],
     spec: BoardSpec,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Refine corners ``pixels`` (n, 2) found in ``image`` (H, W).
 
     ``board_xy`` (n, 2) are the same corners on the board in metres and ``homography`` maps board to picture;
     they give the edges' directions and the place of the neighbouring markers. Returns the refined corners
-    (n, 2) and which of them (n,) were fitted well enough to be used.
+    (n, 2) and how clearly (n,) each was seen: its contrast over the misfit, zero where it cannot be used.
     """
     frame = _local_frames(homography, board_xy)  # (n, 2, 2): board metres -> pixels, near each corner
-    square_px = np.median(np.linalg.norm(frame, axis=1)) * spec.square_m
+    square_px = np.median(np.linalg.norm(frame, axis=1)) * spec.plain_m[0]
     half = int(np.clip(round(0.45 * square_px), 3, _MAX_HALF_WINDOW_PX))
     centre = np.round(pixels).astype(np.int64)
     height, width = image.shape
     inside = np.all((centre >= half) & (centre < np.array([width, height]) - half), axis=1)
     if not inside.any():
-        return pixels, inside
+        return pixels, np.zeros(len(pixels))
     centre, frame = centre[inside], frame[inside]
 
     steps = np.arange(-half, half + 1)
@@ -52,13 +52,13 @@ def refine_corners(
     values = image[rows, columns].astype(np.float64)
     start = pixels[inside] - centre
     weights = _free_of_markers(offsets[None] - start[:, None], frame, spec)
-    fitted, good = _fit(values, offsets, weights, start, frame)
+    fitted, clarity = _fit(values, offsets, weights, start, frame)
 
-    refined, usable = pixels.copy(), inside.copy()
+    refined, seen = pixels.copy(), np.zeros(len(pixels))
     refined[inside] = centre + fitted
-    usable[inside] = good
-    refined[~usable] = pixels[~usable]
-    return refined, usable
+    seen[inside] = clarity
+    refined[seen == 0] = pixels[seen == 0]
+    return refined, seen
 
 
 def _local_frames(H: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -74,9 +74,10 @@ def _free_of_markers(
     """1 where a pixel (n, m, 2), relative to the corner, sees only the corner's own four squares; else 0."""
     on_board = np.abs(offsets @ np.swapaxes(np.linalg.inv(frame), 1, 2))  # (n, m, 2) metres
     guard = 1.5 / np.linalg.norm(frame, axis=1).min(axis=1)[:, None]  # 1.5 px of blur, in metres
-    margin = 0.5 * (spec.square_m - spec.marker_m)
+    square_m, marker_m = spec.plain_m
+    margin = 0.5 * (square_m - marker_m)
     near_an_edge = on_board.min(axis=-1) < np.maximum(margin - guard, 0.5 * guard)
-    within_squares = on_board.max(axis=-1) < spec.square_m - np.minimum(guard, 0.5 * spec.square_m)
+    within_squares = on_board.max(axis=-1) < square_m - np.minimum(guard, 0.5 * square_m)
     return (near_an_edge & within_squares).astype(np.float64)
 
 
@@ -86,7 +87,7 @@ def _fit(
     weights: NDArray[np.float64],
     start: NDArray[np.float64],
     frame: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Levenberg-Marquardt on all corners at once; values, weights (n, m), offsets (m, 2), start (n, 2)."""
     n = len(values)
     p = np.zeros((n, _PARAMETERS))
@@ -129,7 +130,7 @@ def _fit(
         & (p[:, 4] < 3.9)
         & (count > 2 * _PARAMETERS)
     )
-    return p[:, :2], good
+    return p[:, :2], np.where(good, np.abs(p[:, 6]) / np.maximum(noise, 1e-9), 0.0)
 
 
 def _with(p: NDArray[np.float64], column: int, value: float) -> NDArray[np.float64]:

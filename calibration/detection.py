@@ -3,30 +3,19 @@ there."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board import DICTIONARIES, BoardSpec, dictionary
 from calibration.corners import refine_corners
+from calibration.finders import MIN_CORNERS, Detection, board_homography, find, to_u8
+from calibration.glare import GLARE_DOLP, Channel, glare, intensity, without_glare
 from dataset.frames import Mosaic
-from dataset.polarimetry import Raw, split_angles
+from dataset.polarimetry import Raw
 
-MIN_CORNERS = 6
-"""A view with fewer corners is not used (our choice): a pose needs 4, and two more let an error show."""
-
-
-@dataclass(frozen=True, eq=False)
-class Detection:
-    """Corners of one board in one picture: ``ids`` (n,) i64 and ``pixels`` (n, 2) f64, x then y."""
-
-    ids: NDArray[np.int64]
-    pixels: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.ids)
+_CLEARER = 1.3
+"""S0, which is the mean of four pixels, is left only for a picture that shows a corner so much better."""
 
 
 def detect(image: NDArray[np.generic], spec: BoardSpec) -> Detection | None:
@@ -34,43 +23,80 @@ def detect(image: NDArray[np.generic], spec: BoardSpec) -> Detection | None:
 
     ``None`` when fewer than :data:`MIN_CORNERS` corners agree with the board's geometry.
     """
-    found = _find(image, spec)
-    return None if found is None else _refine(image, found, spec)
+    found = find(image, spec)
+    if found is None:
+        return None
+    pixels, clarity = _refine(image, found, spec)
+    return _clear(found.ids, pixels, clarity, spec)
 
 
 def detect_in_mosaic(raw: Raw, layout: Mosaic, spec: BoardSpec) -> Detection | None:
     """Corners of ``spec`` in a raw polarization mosaic (H, W), reported in mosaic pixels.
 
     The picture searched is S0 at half the mosaic's resolution: the mean of each 2x2 polarizer cell, which no
-    polarized glare modulates. The centre of its pixel (u, v) lies at (2u + 0.5, 2v + 0.5) of the mosaic.
+    polarization modulates. The centre of its pixel (u, v) lies at (2u + 0.5, 2v + 0.5) of the mosaic. Where
+    the board's light is polarized by glare, or S0 does not show the board, the least intensity over all
+    polarizer angles and the four angle images are searched, too, and every corner is taken from the picture
+    that shows it most clearly.
     """
-    intensity = intensity_image(raw, layout)
-    found = _find(intensity, spec)
-    if found is None:
+    channels = [intensity(raw)]
+    found = [_find_in(channels[0], layout, spec)]
+    if found[0] is None or glare(raw, _hull(found[0], channels[0].image.shape)) > GLARE_DOLP:
+        channels += without_glare(raw)
+        found += [_find_in(channel, layout, spec) for channel in channels[1:]]
+    known = _merged([(c, f) for c, f in zip(channels, found, strict=True) if f is not None])
+    if known is None:
         return None
-    if layout == "colour":
-        # The first gains came from the whole picture. The board itself is grey, so it balances the Bayer
-        # sites better than any coloured table around it does.
-        hull = cv2.convexHull(found.pixels.astype(np.float32)).astype(np.int32)
-        on_board = cv2.fillConvexPoly(np.zeros(intensity.shape, np.uint8), hull, 1).astype(bool)
-        intensity = _balance_bayer(intensity, on_board)
-    refined = _refine(intensity, found, spec)
-    return None if refined is None else Detection(refined.ids, 2.0 * refined.pixels + 0.5)
+    best, most = known.pixels.copy(), np.zeros(len(known))
+    for channel in channels:
+        here = Detection(known.ids, channel.from_mosaic(known.pixels))
+        pixels, clarity = _refine(_balanced(channel.image, layout, here), here, spec)
+        clearer = clarity > _CLEARER * most
+        best[clearer], most[clearer] = channel.to_mosaic(pixels)[clearer], clarity[clearer]
+    return _clear(known.ids, best, most, spec)
+
+
+def _find_in(channel: Channel, layout: Mosaic, spec: BoardSpec) -> Detection | None:
+    whole = np.ones(channel.image.shape, bool)
+    return find(_balance_bayer(channel.image, whole) if layout == "colour" else channel.image, spec)
+
+
+def _merged(found: list[tuple[Channel, Detection]]) -> Detection | None:
+    """Every corner found in any picture, once, in mosaic pixels; None when there is none."""
+    if not found:
+        return None
+    found = sorted(found, key=lambda pair: -len(pair[1]))
+    ids, first = np.unique(np.concatenate([f.ids for _, f in found]), return_index=True)
+    return Detection(ids, np.concatenate([c.to_mosaic(f.pixels) for c, f in found])[first])
+
+
+def _balanced(image: NDArray[np.float32], layout: Mosaic, found: Detection) -> NDArray[np.float32]:
+    """The Bayer sites balanced over the board: it is grey, whatever stands around it."""
+    return _balance_bayer(image, _hull(found, image.shape)) if layout == "colour" else image
+
+
+def _hull(found: Detection, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The part of a picture that the corners surround."""
+    hull = cv2.convexHull(found.pixels.astype(np.float32)).astype(np.int32)
+    return cv2.fillConvexPoly(np.zeros(shape, np.uint8), hull, 1).astype(bool)
 
 
 def intensity_image(raw: Raw, layout: Mosaic) -> NDArray[np.float32]:
     """Mean intensity of every 2x2 polarizer cell, (H/2, W/2) f32, with the Bayer sites of a colour sensor
     balanced."""
-    intensity = split_angles(raw).astype(np.float32).mean(axis=0)
-    if layout == "colour":
-        return _balance_bayer(intensity, np.ones(intensity.shape, bool))
-    return intensity
+    image = intensity(raw).image
+    return _balance_bayer(image, np.ones(image.shape, bool)) if layout == "colour" else image
 
 
 def explain_missing_board(image: NDArray[np.generic], spec: BoardSpec) -> str:
     """Why ``spec`` is not found in ``image`` (H, W): another dictionary, another size, a mirrored picture,
     or nothing there."""
-    grey = _to_u8(image)
+    grey = to_u8(image)
+    if spec.kind == "checkerboard":
+        return (
+            f"no chessboard of {spec.squares_x}x{spec.squares_y} squares is visible as a whole: check the"
+            " count of squares (not of inner corners), exposure, focus, and that no corner is hidden"
+        )
     found = _marker_ids(grey, spec.dictionary)
     if len(found) >= 3:
         if found.max() >= spec.marker_count:
@@ -94,41 +120,31 @@ def explain_missing_board(image: NDArray[np.generic], spec: BoardSpec) -> str:
     return "no marker of any dictionary is visible: check exposure, focus, and that the board is in view"
 
 
-def _find(image: NDArray[np.generic], spec: BoardSpec) -> Detection | None:
-    """OpenCV's corners, to half a pixel or so, if they are enough and lie as on the board."""
-    corners, ids, _, _ = cv2.aruco.CharucoDetector(spec.aruco).detectBoard(_to_u8(image))
-    if ids is None or len(ids) < MIN_CORNERS:
-        return None
-    found = Detection(
-        np.asarray(ids).reshape(-1).astype(np.int64), np.asarray(corners).reshape(-1, 2).astype(np.float64)
-    )
-    return None if _homography(found, spec) is None else found
-
-
-def _refine(image: NDArray[np.generic], found: Detection, spec: BoardSpec) -> Detection | None:
-    homography = _homography(found, spec)
+def _refine(
+    image: NDArray[np.generic], found: Detection, spec: BoardSpec
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Refined pixels (n, 2), and how clearly each corner was seen."""
+    homography = board_homography(found, spec)
     if homography is None:
-        return None
+        return found.pixels, np.zeros(len(found))
     board_xy = spec.object_points(found.ids)[:, :2]
-    pixels, good = refine_corners(np.asarray(image, np.float32), found.pixels, board_xy, homography, spec)
-    on_one_line = np.linalg.matrix_rank(board_xy[good] - board_xy[good][:1], tol=1e-9) < 2
-    if np.count_nonzero(good) < MIN_CORNERS or on_one_line:
+    return refine_corners(np.asarray(image, np.float32), found.pixels, board_xy, homography, spec)
+
+
+def _clear(
+    ids: NDArray[np.int64], pixels: NDArray[np.float64], clarity: NDArray[np.float64], spec: BoardSpec
+) -> Detection | None:
+    """The corners that were seen clearly; None when they are too few or lie on one line."""
+    good = clarity > 0
+    board_xy = spec.object_points(ids[good])[:, :2]
+    if len(board_xy) < MIN_CORNERS or np.linalg.matrix_rank(board_xy - board_xy[:1], tol=1e-9) < 2:
         return None
-    return Detection(found.ids[good], pixels[good])
+    return Detection(ids[good], pixels[good])
 
 
 def _marker_ids(grey: NDArray[np.uint8], name: str) -> NDArray[np.int64]:
     _, ids, _ = cv2.aruco.ArucoDetector(dictionary(name)).detectMarkers(grey)
     return np.zeros(0, np.int64) if ids is None else ids.reshape(-1).astype(np.int64)
-
-
-def _to_u8(image: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Stretch to 8 bits for OpenCV's marker detector; the refinement reads the original values."""
-    if image.dtype == np.uint8:
-        return np.ascontiguousarray(image)
-    values = np.asarray(image, np.float32)
-    low, high = np.percentile(values[::4, ::4], (0.5, 99.5))
-    return np.clip((values - low) * (255.0 / max(float(high - low), 1e-6)), 0, 255).astype(np.uint8)
 
 
 def _balance_bayer(intensity: NDArray[np.float32], where: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -140,15 +156,3 @@ def _balance_bayer(intensity: NDArray[np.float32], where: NDArray[np.bool_]) -> 
         if means[row, column] > 0:
             balanced[row::2, column::2] *= means.mean() / means[row, column]
     return balanced
-
-
-def _homography(found: Detection, spec: BoardSpec) -> NDArray[np.float64] | None:
-    """Board (m) to picture (px), or None when the corners do not look like one plane seen through one
-    lens."""
-    extent = float(np.ptp(found.pixels, axis=0).max())
-    # Lens distortion bends a board by a percent or so of its extent; a misread marker is off by a square.
-    board_xy = spec.object_points(found.ids)[:, :2]
-    H, inliers = cv2.findHomography(board_xy, found.pixels, cv2.RANSAC, max(2.0, 0.02 * extent))
-    if H is None or np.mean(inliers) < 0.8:
-        return None
-    return np.asarray(H, np.float64)

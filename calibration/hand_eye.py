@@ -197,7 +197,8 @@ def calibrate_hand_eye(
     if refine_camera and intrinsics_covariance is not None:
         information = np.zeros((len(free), len(free)))
         information[CAMERA, CAMERA] = np.linalg.inv(intrinsics_covariance)
-    found = fit(replace(state, expected=state), kept, free, information)
+        state = replace(state, expected=state)
+    found = fit(state, kept, free, information)
     scale, scale_sigma = _board_scale(found, kept)
     if abs(scale - 1) > max(_WRONG_SCALE, 6 * scale_sigma):
         raise CalibrationError(

@@ -89,7 +89,9 @@ class HandEyeState:
 
     @property
     def shared_deviation(self) -> Floats:
-        before = self if self.expected is None else self.expected
+        before = self.expected
+        if before is None:
+            return np.zeros(14 + 4 + len(self.camera.distortion))
         return np.concatenate(
             [
                 (before.T_mount_cam.inverse() @ self.T_mount_cam).log(),

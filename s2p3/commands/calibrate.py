@@ -20,23 +20,43 @@ _FEWEST_PX_PER_SQUARE = 20
 """Two pixels a marker's cell, or nearly."""
 
 
-def board(*, rig: Path, out: Path, px_per_square: int = 300) -> None:
-    """Draw the rig's ChArUco board as a PNG to print; measure the print afterwards.
+def board(
+    *,
+    rig: Path,
+    out: OptionalPath = None,
+    pdf: OptionalPath = None,
+    page: str = "A4",
+    px_per_square: int = 300,
+) -> None:
+    """Draw the rig's board to print; measure the print afterwards.
 
     Args:
         rig: rig.toml with the [board] table.
         out: PNG to write.
-        px_per_square: resolution of the picture.
+        pdf: PDF to write: to scale, with a ruler to check the print.
+        page: of the PDF: A4, A3, A2, or WIDTHxHEIGHT in millimetres.
+        px_per_square: resolution of the PNG.
     """
     import cv2
 
     from calibration.board import draw
+    from calibration.board_pdf import board_pdf
+    from dataset.errors import ToolkitError
 
     at_least(_FEWEST_PX_PER_SQUARE, px_per_square=px_per_square)
-    _, picture = cv2.imencode(".png", draw(board_of(rig), px_per_square, margin_px=px_per_square // 2))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_bytes(picture.tobytes())
-    say(f"{out}: print it to scale, then measure a square and correct [board] square_m in {rig}")
+    if out is None and pdf is None:
+        raise ToolkitError("board: nothing to write; give --pdf board.pdf to print, or --out board.png")
+    spec = board_of(rig)
+    written: dict[Path, bytes] = {}
+    if pdf is not None:
+        written[pdf] = board_pdf(spec, page)
+    if out is not None:
+        _, picture = cv2.imencode(".png", draw(spec, px_per_square, margin_px=px_per_square // 2))
+        written[out] = picture.tobytes()
+    for path, content in written.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        say(f"{path}: print it at 100 %, then measure a square and correct [board] square_m in {rig}")
 
 
 def intrinsics(

@@ -1,5 +1,6 @@
 """The board's description: what it refuses, where its corners are, and that drawing and detection agree."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -66,3 +67,53 @@ def test_an_empty_picture_has_no_board():
     image = np.full((300, 400), 120, np.uint8)
     assert detect(image, SPEC) is None
     assert "no marker" in explain_missing_board(image, SPEC)
+
+
+CHESSBOARD = BoardSpec(8, 5, 0.03, 0.0, "", "checkerboard")
+APRILGRID = BoardSpec(4, 3, 0.06, 0.045, "DICT_APRILTAG_36H11", "aprilgrid")
+
+
+@pytest.mark.parametrize("spec", [SPEC, CHESSBOARD, APRILGRID], ids=["charuco", "checkerboard", "aprilgrid"])
+@pytest.mark.parametrize("turns", [0, 2])
+def test_every_kind_of_board_is_detected_where_it_was_drawn_either_way_up(spec, turns):
+    image = draw(spec, 96, margin_px=48)
+    turned = cv2.GaussianBlur(np.ascontiguousarray(np.rot90(image, turns)), (0, 0), 0.7)
+    found = detect(turned, spec)
+    assert found is not None
+    assert len(found) == spec.corner_count
+    expected = 48 + spec.object_points(found.ids)[:, :2] / spec.square_m * 96 - 0.5
+    if turns == 2:
+        expected = np.array(image.shape[::-1]) - 1 - expected
+    assert np.abs(found.pixels - expected).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ((8, 6, 0.03, 0.0, "", "checkerboard"), "upside down"),
+        ((4, 3, 0.06, 0.045, "DICT_5X5_100", "aprilgrid"), "APRILTAG_36H11"),
+        ((4, 3, 0.06, 0.07, "DICT_APRILTAG_36H11", "aprilgrid"), "smaller than square_m"),
+    ],
+)
+def test_an_impossible_board_of_another_kind_is_refused(arguments, reason):
+    with pytest.raises(CalibrationError, match=reason):
+        BoardSpec(*arguments)
+
+
+def test_the_rectangles_of_a_charuco_board_are_those_that_opencv_prints():
+    ours = draw(SPEC, 80, margin_px=20)
+    theirs = SPEC.aruco.generateImage(ours.shape[::-1], marginSize=20, borderBits=1)
+    assert np.mean(ours != theirs) < 0.01  # OpenCV rounds its modules to whole pixels
+
+
+def test_a_mirrored_aprilgrid_is_explained():
+    image = np.ascontiguousarray(draw(APRILGRID, 96, margin_px=48)[:, ::-1])
+    assert detect(image, APRILGRID) is None
+    assert "mirrored" in explain_missing_board(image, APRILGRID)
+
+
+def test_a_miscounted_chessboard_is_explained():
+    other = BoardSpec(7, 4, 0.03, 0.0, "", "checkerboard")
+    image = draw(CHESSBOARD, 60, margin_px=60)
+    assert detect(image, BoardSpec(10, 7, 0.03, 0.0, "", "checkerboard")) is None
+    assert "7x4 squares" in explain_missing_board(image, other)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import re
 import socket
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -232,9 +234,59 @@ def test_second_arm_on_the_same_address_is_refused(arm: SimulatedRobot) -> None:
 
 
 @pytest.mark.devices
-def test_unknown_fault_is_refused(arm: SimulatedRobot) -> None:
-    with pytest.raises(DeviceError, match="unknown command 'explode'"):
-        arm.command("explode")
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("explode", "unknown command 'explode'"),
+        ("guide 1 2 3", "'guide' takes 6 numbers, not 3"),
+        ("drift fast", "could not convert"),
+        ("slider 2", "from 0 to 1, not to 2"),
+    ],
+)
+def test_a_fault_that_makes_no_sense_is_refused(arm: SimulatedRobot, line: str, message: str) -> None:
+    with pytest.raises(DeviceError, match=message):
+        arm.command(line)
+
+
+@pytest.mark.devices
+def test_every_fault_is_in_the_guide(arm: SimulatedRobot) -> None:
+    guide = (Path(__file__).parents[2] / "docs" / "simulated-lab.md").read_text(encoding="utf-8")
+    with pytest.raises(DeviceError) as refusal:
+        arm.command("?")
+    verbs = str(refusal.value).partition("; use ")[2].replace("or ", "").split(", ")
+    assert len(verbs) > 15
+    assert [verb for verb in verbs if not re.search(rf"`{verb}[ `]", guide)] == []
+
+
+@pytest.mark.devices
+def test_drift_begins_when_it_is_told_to(arm: SimulatedRobot) -> None:
+    arm.command("drift 2000")
+    try:
+        records = read(arm, ["timestamp", TRUE_TIME_VARIABLE], 200)
+    finally:
+        arm.command("drift 0")
+    rate = np.ptp(records["timestamp"]) / np.ptp(records[TRUE_TIME_VARIABLE])
+    assert rate == pytest.approx(1.002, abs=1e-6)
+
+
+@pytest.mark.devices
+def test_a_restart_forgets_everything_but_the_joints(arm: SimulatedRobot) -> None:
+    arm.command("tcp 0 0 0.1 0 0 0")
+    arm.command("restart")
+    (record, *_) = read(arm, ["timestamp", "tcp_offset", "actual_q", "runtime_state"], 1)
+    assert record["timestamp"] < 1010
+    np.testing.assert_array_equal(record["tcp_offset"], np.zeros(6))
+    assert record["runtime_state"] == 1
+
+
+@pytest.mark.devices
+def test_the_unmodified_client_is_refused_in_local_mode(arm: SimulatedRobot) -> None:
+    arm.command("local")
+    try:
+        with pytest.raises(RuntimeError, match="remote control"):
+            rtde_control.RTDEControlInterface(arm.host)
+    finally:
+        arm.command("remote")
 
 
 @pytest.mark.devices

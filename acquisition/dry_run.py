@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from acquisition.rig import Rig, open_pose_source
 from acquisition.robots.limits import MotionLimits
 from acquisition.routes import Route, carried_camera
 from acquisition.trajectories import rotation_spread_deg, seen_cells
-from dataset.errors import DeviceError
+from dataset.errors import ToolkitError
 from dataset.transforms import SE3
 from dataset.view_sphere import ViewSphere
 
@@ -57,9 +57,15 @@ class Stance:
 
 
 def stance(rig: Rig) -> Stance:
-    """Asks the arm where it stands, only reading it; where none answers, takes a bent arm above the table."""
-    with contextlib.suppress(DeviceError), open_pose_source(rig) as source:
-        return Stance(source.sample().q, source.tcp_offset, known=True)
+    """Asks the arm where it stands, only reading it; where none answers, takes a bent arm above the table.
+
+    The tool is the rig's, as a capture would set it, whatever is active now.
+    """
+    any_tool = replace(rig, robot=replace(rig.robot, tcp_offset=None))
+    for readable in (any_tool, rig):  # the second for software that does not tell its tool
+        with contextlib.suppress(ToolkitError), open_pose_source(readable) as source:
+            tool = rig.robot.tcp_offset or source.tcp_offset
+            return Stance(source.sample().q, np.array(tool, dtype=np.float64), known=True)
     tool = rig.robot.tcp_offset or (0.0,) * 6
     return Stance(np.array(READY), np.array(tool, dtype=np.float64), known=False)
 
@@ -114,13 +120,18 @@ def dry_run(rig: Rig, page: Path, plan: Callable[[CarriedCamera, Floats], Route]
         The route's figures.
 
     Raises:
-        ToolkitError: nothing is within reach, or the route leaves the workspace.
+        ToolkitError: nothing is within reach, the route leaves the workspace, or the page cannot be written.
     """
     here = stance(rig)
     route = plan(carried_camera(rig, here.tcp_offset), here.q)
     figures = outlook(route, rig)
-    page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text(_page(route, rig, here.known, figures), encoding="utf-8")
+    try:
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.write_text(_page(route, rig, here.known, figures), encoding="utf-8")
+    except OSError as error:
+        raise ToolkitError(
+            f"{page} cannot be written ({error.strerror}); name a folder you may write to"
+        ) from error
     return figures
 
 

@@ -87,6 +87,12 @@ def test_without_an_arm_a_stance_is_assumed() -> None:
     np.testing.assert_array_equal(here.q, READY)
 
 
+def test_a_page_that_cannot_be_written(tmp_path: Path, sweeps: Route) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ToolkitError, match=r"cannot be written .*; name a folder"):
+        dry_run(RIG, tmp_path / "file" / "page.html", lambda carried, q: sweeps)
+
+
 @pytest.mark.devices
 def test_with_an_arm_its_stance_and_tool_are_read_and_nothing_else(tmp_path: Path) -> None:
     rig = replace(RIG, robot=replace(RIG.robot, host="127.0.0.38", silence_s=1.0))
@@ -105,6 +111,19 @@ def test_with_an_arm_its_stance_and_tool_are_read_and_nothing_else(tmp_path: Pat
     np.testing.assert_allclose(carried.T_flange_tcp.translation, [0, 0, 0.05])
     np.testing.assert_allclose(q, READY)
     assert "where the arm stands now" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.devices
+@pytest.mark.parametrize("software", [(5, 12, 4), (5, 4, 0)])
+def test_the_tool_is_the_one_that_a_capture_would_set(software: tuple[int, int, int]) -> None:
+    tool = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+    rig = replace(RIG, robot=replace(RIG.robot, host="127.0.0.39", silence_s=1.0, tcp_offset=tool))
+    with SimulatedRobot(rig.robot.host, software=software) as arm:
+        if software < (5, 5, 1):  # which cannot be read with another tool
+            arm.command("tcp 0 0 0.1 0 0 0")
+        here = stance(rig)
+    assert here.known
+    np.testing.assert_allclose(here.tcp_offset, tool)
 
 
 def test_points_land_where_they_are_seen() -> None:

@@ -22,6 +22,8 @@ _COARSE_STEPS = 12
 _PROMISING = 80
 _NOISE_FLOOR_M = 1e-4  # touching is no better than this (our choice); keeps a perfect fit's covariance honest
 _BAD_FIT_M = 5e-3
+_DOUBTFUL_FIT_M = 1.5e-3
+"""From here on it is worth asking whether the mirror image fits better (our choice)."""
 _SMALLEST_SHARE = 0.02
 """Of the mesh's size: points that span less were touched on something smaller."""
 
@@ -88,7 +90,8 @@ def register_points(
     coarse, coarse_rms = _nearest_fits(points, surface, init, seed)
     best = coarse[int(np.argmin(coarse_rms))]
     limit = max(_BAD_FIT_M, 0.03 * float(np.linalg.norm(mesh.extents)))
-    _require_fit(float(coarse_rms.min()), 3 * limit, points, surface, seed)
+    if coarse_rms.min() > 3 * limit:
+        _require_fit(float(coarse_rms.min()), limit, points, surface, seed)
     pose, signed, normals = finest_fit(points, surface, best, seed)
     rms = float(np.sqrt(np.mean(signed**2)))
     _require_fit(rms, limit, points, surface, seed)
@@ -168,21 +171,22 @@ def _require_size(points: Floats, mesh: trimesh.Trimesh) -> None:
 
 
 def _require_fit(rms: float, limit: float, points: Floats, surface: Surface, seed: int) -> None:
-    if rms <= limit:
+    if rms <= min(limit, _DOUBTFUL_FIT_M):
         return
     mesh = surface.mesh
     flipped = trimesh.Trimesh(mesh.vertices * [-1, 1, 1], mesh.faces[:, ::-1], process=False)
     mirrored = float(_nearest_fits(points, Surface.of(flipped, surface.ball_m, seed), None, seed)[1].min())
-    if mirrored < 0.3 * min(rms, limit):
+    if mirrored < 0.3 * rms:
         raise CalibrationError(
             f"object pose: the points fit the mesh's mirror image ({1000 * mirrored:.1f} mm) and not the mesh"
             f" ({1000 * rms:.1f} mm); export it again with the right handedness"
         )
-    raise CalibrationError(
-        f"object pose: the best fit leaves the points {1000 * rms:.1f} mm from the surface; check the mesh's"
-        f" units (it is {1000 * np.linalg.norm(mesh.extents):.0f} mm across), the tool tip's offset, and that"
-        " the right object was touched"
-    )
+    if rms > limit:
+        raise CalibrationError(
+            f"object pose: the best fit leaves the points {1000 * rms:.1f} mm from the surface; check the"
+            f" mesh's units (it is {1000 * np.linalg.norm(mesh.extents):.0f} mm across), the tool tip's"
+            " offset, and that the right object was touched"
+        )
 
 
 def _starts(points: Floats, surface: Surface, init: SE3 | None, seed: int) -> SE3:

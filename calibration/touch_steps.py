@@ -89,9 +89,11 @@ def add_object(
     """
     paths = [touches] if isinstance(touches, Path) else list(touches)
     found = [_read(path, calibration, tip) for path in paths]
-    results = [
-        register_points(t.points, vertices, faces, symmetry_axis=symmetry_axis, tip=t.tip) for t in found
-    ]
+    first = register_points(found[0].points, vertices, faces, None, symmetry_axis, found[0].tip)
+    results = [first]
+    for t in found[1:]:
+        # From where the first found it: of the poses that an object's symmetry makes equal, the same one.
+        results.append(register_points(t.points, vertices, faces, first.T_base_obj, symmetry_axis, t.tip))
     sources = tuple(Source.of(path) for path in paths)
     record = _fused(results, sources, symmetry_axis)
     _known(calibration).merged(Calibration(objects={name: record})).save(calibration)

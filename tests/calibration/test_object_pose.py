@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from calibration.fusion import fuse_poses
+from calibration.object_observability import Tip
 from calibration.object_pose import register_points
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3, rotation_error_deg, translation_error_mm
@@ -115,3 +117,92 @@ def test_a_mesh_in_another_unit_is_refused_with_its_size():
     cup = _cup(handle=True)
     with pytest.raises(CalibrationError, match="mesh is only 0 mm across"):
         register_points(_touch(cup, 24, 0), 1e-3 * cup.vertices, cup.faces)
+
+
+def test_a_mesh_in_millimetres_is_refused_with_its_size():
+    cup = _cup(handle=True)
+    with pytest.raises(CalibrationError, match="not millimetres"):
+        register_points(_touch(cup, 24, 0), 1e3 * cup.vertices, cup.faces)
+
+
+def _hand():
+    """A block with three unequal arms along its axes: its mirror image is another object."""
+    arms = [
+        ((0.12, 0.02, 0.02), (0.05, 0, 0)),
+        ((0.02, 0.08, 0.02), (0, 0.04, 0)),
+        ((0.02, 0.02, 0.05), (0, 0, 0.03)),
+    ]
+    boxes = [trimesh.creation.box(size).apply_translation(place) for size, place in arms]
+    return trimesh.boolean.union(boxes)
+
+
+def test_a_mirrored_mesh_is_refused_as_such():
+    hand = _hand()
+    points = TRUTH.apply(trimesh.sample.sample_surface(hand, 60, seed=1)[0])
+    assert register_points(points, hand.vertices, hand.faces).rms_m < 1e-4
+    with pytest.raises(CalibrationError, match="mirror image"):
+        register_points(points, hand.vertices * [1, -1, 1], hand.faces[:, ::-1])
+
+
+def test_points_on_one_flat_face_leave_three_directions_open_and_name_them():
+    box = trimesh.creation.box([0.08, 0.06, 0.05])
+    rng = np.random.default_rng(0)
+    top = np.column_stack([rng.uniform(-0.03, 0.03, 20), rng.uniform(-0.02, 0.02, 20), np.full(20, 0.025)])
+    result = register_points(TRUTH.apply(top), box.vertices, box.faces, init=TRUTH)
+    words = " | ".join(result.unobservable)
+    assert "position along the object's x axis" in words
+    assert "position along the object's y axis" in words
+    assert "rotation about the object's z axis" in words
+    assert "position along the object's z axis" not in words
+
+
+def test_a_balls_radius_is_taken_off():
+    cup = _cup(handle=True)
+    points, face = trimesh.sample.sample_surface(cup, 4000, seed=1)
+    outside = (np.linalg.norm(points[:, :2], axis=1) > 0.0365) & (cup.face_normals[face][:, 2] > -0.5)
+    chosen = np.flatnonzero(outside)[:60]
+    centres = TRUTH.apply(points[chosen] + 0.003 * cup.face_normals[face[chosen]])
+    with_ball = register_points(centres, cup.vertices, cup.faces, tip=Tip(ball_m=0.003))
+    assert translation_error_mm(with_ball.T_base_obj, TRUTH) < 0.3
+    as_point = register_points(centres, cup.vertices, cup.faces)
+    assert as_point.rms_m > 4 * with_ball.rms_m
+
+
+def test_the_tips_own_error_ends_up_in_the_pose():
+    cup = _cup(handle=True)
+    points = _touch(cup, 30, 0)
+    rng = np.random.default_rng(0)
+    upright = SE3.from_rotvec(rng.normal(0, 0.05, (30, 3)), np.zeros((30, 3))).rotation
+    exact = register_points(points, cup.vertices, cup.faces, init=TRUTH)
+    known = Tip(covariance=1e-6 * np.eye(3), rotation=upright)
+    found = register_points(points, cup.vertices, cup.faces, init=TRUTH, tip=known)
+    added = found.covariance - exact.covariance
+    np.testing.assert_allclose(added, found.tip_covariance, atol=1e-12)
+    # Touched with the tool held one way, a tip that is 1 mm off puts the object 1 mm off.
+    np.testing.assert_allclose(np.sqrt(np.diagonal(added)[:3]), 1e-3, rtol=0.25)
+
+
+def test_poses_of_several_sessions_are_fused_and_a_moved_object_is_noticed():
+    cup = _cup(handle=True)
+    results = [
+        register_points(_touch(cup, 24, seed), cup.vertices, cup.faces, init=TRUTH) for seed in (0, 1, 2)
+    ]
+    poses, covariances = SE3.stack([r.T_base_obj for r in results]), [r.covariance for r in results]
+    fused = fuse_poses(poses, covariances)
+    assert np.trace(fused.covariance) < 0.5 * min(np.trace(c) for c in covariances)
+    error = (fused.pose.inverse() @ TRUTH).log()
+    assert error @ np.linalg.solve(fused.covariance, error) < 20
+    moved = SE3.stack([poses[0], poses[1], SE3.from_rotvec(np.zeros(3), [0.003, 0, 0]) @ poses[2]])
+    with pytest.raises(CalibrationError, match="moved in between"):
+        fuse_poses(moved, covariances)
+
+
+def test_turns_of_a_round_body_do_not_count_when_poses_are_fused():
+    axis = np.array([0.0, 0.0, 1.0])
+    turned = SE3.stack([TRUTH @ SE3.from_rotvec([0, 0, angle], [0, 0, 0]) for angle in (0.0, 1.9, -2.8)])
+    covariance = np.diag([1e-8] * 3 + [1e-5, 1e-5, np.pi**2 / 3])
+    fused = fuse_poses(turned, [covariance] * 3, symmetry_axis=axis)
+    assert translation_error_mm(fused.pose, TRUTH) < 1e-6
+    np.testing.assert_allclose(fused.pose.rotation[:, 2], TRUTH.rotation[:, 2], atol=1e-9)
+    with pytest.raises(CalibrationError, match="contradict"):
+        fuse_poses(turned, [np.diag([1e-8] * 3 + [1e-5] * 3)] * 3)

@@ -6,11 +6,10 @@ S2P3 paper's table of refractive indices; the shapes themselves are our own (see
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,64 +19,15 @@ from scipy.spatial.distance import pdist
 from dataset import SE3, ToolkitError
 from dataset.session import ObjectRecord
 from s2p3 import object_meshes
+from s2p3.materials import Kind, Material, load_material
 from s2p3.rendering.mesh import Mesh
+from s2p3.symmetry import Proposal, Symmetry, propose
 
 if TYPE_CHECKING:
     import trimesh
 
-_LARGEST_M = 2.0
-
-
-@dataclass(frozen=True, eq=False)
-class Symmetry:
-    """Rigid motions that leave an object looking the same; none by default.
-
-    Attributes:
-        transforms: (n, 4, 4) float64, object <- object, the identity not listed.
-        axis: (3,) unit direction through the origin about which any rotation is a symmetry, or None.
-    """
-
-    transforms: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    axis: NDArray[np.float64] | None = None
-
-    @property
-    def any(self) -> bool:
-        """Whether the object has a symmetry: its metric is then ADD-S, otherwise ADD."""
-        return self.axis is not None or len(self.transforms) > 0
-
-    def sampled(self, steps: int = 72) -> NDArray[np.float64]:
-        """The symmetries as a finite list (m, 4, 4), the identity first; the continuous axis in `steps`."""
-        discrete = np.concatenate([np.eye(4)[None], self.transforms])
-        if self.axis is None:
-            return discrete
-        turns = 2 * np.pi * np.arange(steps) / steps
-        around = SE3.from_rotvec(turns[:, None] * self.axis, np.zeros((steps, 3))).as_matrix()
-        return (around[:, None] @ discrete[None]).reshape(-1, 4, 4)
-
-    def to_json(self) -> str:
-        """The two keys of the BOP challenge's models_info.json, in metres."""
-        continuous = [] if self.axis is None else [{"axis": self.axis.tolist(), "offset": [0.0, 0.0, 0.0]}]
-        discrete = [matrix.ravel().tolist() for matrix in self.transforms]
-        return json.dumps({"symmetries_discrete": discrete, "symmetries_continuous": continuous})
-
-    @staticmethod
-    def from_json(text: str) -> Symmetry:
-        """Inverse of `to_json`; an empty text means no symmetry.
-
-        Raises:
-            ToolkitError: not such a JSON text.
-        """
-        try:
-            data: dict[str, Any] = json.loads(text) if text else {}
-            discrete = np.array(data.get("symmetries_discrete", []), dtype=np.float64).reshape(-1, 4, 4)
-            continuous = data.get("symmetries_continuous", [])
-            axis = np.array(continuous[0]["axis"], dtype=np.float64) if continuous else None
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ToolkitError(
-                f"object symmetry: cannot read {text[:60]!r} ({error}); expected JSON with "
-                "symmetries_discrete (16 numbers each) and symmetries_continuous (axis, offset)"
-            ) from error
-        return Symmetry(discrete, axis if axis is None else axis / np.linalg.norm(axis))
+_LARGEST_M, _SMALLEST_M = 2.0, 0.005
+_PROPOSAL_POINTS = 150_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,21 +38,25 @@ class ObjectModel:
         name: what sessions and reports call it.
         vertices: (V, 3) float64, metres, object frame.
         faces: (F, 3) int32, counter-clockwise seen from outside.
-        material: "plastic", "steel" or "glass"; how synthesis shades it.
+        material: "plastic", "metal" or "glass"; how synthesis shades it.
         refractive_index: real part n of the refractive index.
-        extinction: imaginary part k; 0 as in the paper.
+        extinction: imaginary part k; 0 as in the paper, also for metals.
         symmetry: rigid motions that leave it unchanged.
         diameter: largest distance between two of its points, metres.
+        albedo: share of light that its body returns; None lets synthesis draw it.
+        roughness: alpha of microfacets; None lets synthesis draw it.
     """
 
     name: str
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
-    material: str
+    material: Kind
     refractive_index: float
     extinction: float
     symmetry: Symmetry
     diameter: float
+    albedo: float | None = None
+    roughness: float | None = None
 
     @cached_property
     def mesh(self) -> Mesh:
@@ -130,20 +84,31 @@ class ObjectModel:
 
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
         """(count, 3) points drawn uniformly over the surface, the same for the same seed."""
+        return self._drawn(count, seed)[0]
+
+    def proposed_symmetry(self) -> Proposal:
+        """What the mesh looks symmetric under: for its user to accept, never assumed."""
+        return propose(self._drawn(_PROPOSAL_POINTS, 0), self.vertices, self.diameter)
+
+    def _drawn(self, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Points over the surface and the unit normals of their faces, each (count, 3)."""
         rng = np.random.default_rng(seed)
         corners = self.vertices[self.faces]
-        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        chosen = corners[rng.choice(len(areas), size=count, p=areas / areas.sum())]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(normals, axis=1)
+        face = rng.choice(len(areas), size=count, p=areas / areas.sum())
+        chosen = corners[face]
         u, v = rng.random((2, count, 1))
         root = np.sqrt(u)
-        return (1 - root) * chosen[:, 0] + root * (1 - v) * chosen[:, 1] + root * v * chosen[:, 2]
+        points = (1 - root) * chosen[:, 0] + root * (1 - v) * chosen[:, 1] + root * v * chosen[:, 2]
+        return points, normals[face] / areas[face, None]
 
 
 @dataclass(frozen=True)
 class _Design:
     """What is fixed about a built-in object besides its shape."""
 
-    material: str
+    material: Kind
     refractive_index: float
     diameter: float
     axis: tuple[float, float, float] | None = None
@@ -157,8 +122,8 @@ _BUILDERS = {
 }
 _DESIGNS = {
     "cup": _Design("plastic", 1.50, 0.1387),
-    "fork": _Design("steel", 2.75, 0.1892),
-    "knife": _Design("steel", 2.75, 0.2309),
+    "fork": _Design("metal", 2.75, 0.1892),
+    "knife": _Design("metal", 2.75, 0.2309),
     "bottle": _Design("glass", 1.52, 0.1397, axis=(0.0, 0.0, 1.0)),
 }
 NAMES = tuple(_BUILDERS)
@@ -192,39 +157,64 @@ def build(name: str) -> ObjectModel:
     )
 
 
-def named_object(name: str, mesh: str | Path | None = None) -> ObjectModel:
+def named_object(
+    name: str, mesh: str | Path | None = None, material: str | Path | None = None
+) -> ObjectModel:
     """A built-in object, or, given a mesh file, an object of that name loaded from it.
 
+    Args:
+        mesh: PLY, OBJ or STL in metres.
+        material: material file; without one, that beside the mesh (mug.toml beside mug.ply) where there is
+            one. A built-in object given one keeps its shape and symmetry.
+
     Raises:
-        ToolkitError: see `build` and `load`.
+        ToolkitError: see `build`, `load` and `materials.load_material`.
     """
-    return build(name) if mesh is None else load(mesh, name=name)
+    if mesh is None:
+        model = build(name)
+        return model if material is None else _made_of(model, load_material(material))
+    beside = Path(mesh).with_suffix(".toml")
+    file = material if material is not None else beside if beside.is_file() else None
+    return load(mesh, name=name, made_of=Material() if file is None else load_material(file))
 
 
-def load(
-    path: str | Path,
-    *,
-    name: str | None = None,
-    material: str = "plastic",
-    refractive_index: float = 1.5,
-    extinction: float = 0.0,
-    symmetry: Symmetry | None = None,
-) -> ObjectModel:
+def _made_of(model: ObjectModel, material: Material) -> ObjectModel:
+    return replace(
+        model,
+        material=material.kind,
+        refractive_index=material.refractive_index,
+        extinction=material.extinction,
+        albedo=material.albedo,
+        roughness=material.roughness,
+    )
+
+
+def load(path: str | Path, *, name: str | None = None, made_of: Material | None = None) -> ObjectModel:
     """An object from a PLY, OBJ or STL file in metres; its frame is the file's.
 
+    Args:
+        made_of: its material and symmetry; a plastic of index 1.5 without symmetry when None.
+
     Raises:
-        ToolkitError: the file is missing or unreadable, the mesh is empty, too large to be in metres, or not
-            watertight.
+        ToolkitError: the file is missing or unreadable, the mesh is empty, hardly in metres by its size, or
+            not watertight.
     """
     path = Path(path)
     mesh = _read(path)
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces, dtype=np.int32)
+    if not np.isfinite(vertices).all():
+        raise ToolkitError(f"{path}: has corners that are no numbers; export the mesh again")
     size = diameter(vertices)
     if size > _LARGEST_M:
         raise ToolkitError(
             f"{path}: the mesh is {size:.1f} m across, so it is probably in millimetres; "
             "scale it by 0.001 and export it in metres"
+        )
+    if size < _SMALLEST_M:
+        raise ToolkitError(
+            f"{path}: the mesh is {1000 * size:.3g} mm across, so it is hardly in metres; "
+            "scale it to its real size and export it in metres"
         )
     if not (mesh.is_watertight and mesh.is_winding_consistent):
         raise ToolkitError(
@@ -233,15 +223,18 @@ def load(
         )
     if mesh.volume < 0:
         faces = np.ascontiguousarray(faces[:, ::-1])
+    made_of = made_of or Material()
     return ObjectModel(
         name or path.stem,
         vertices,
         faces,
-        material,
-        refractive_index,
-        extinction,
-        symmetry or Symmetry(),
+        made_of.kind,
+        made_of.refractive_index,
+        made_of.extinction,
+        made_of.symmetry.symmetry(),
         size,
+        made_of.albedo,
+        made_of.roughness,
     )
 
 

@@ -12,6 +12,7 @@ from s2p3.commands.output import counting, say, show
 
 if TYPE_CHECKING:
     from s2p3.config import ExperimentConfig
+    from s2p3.objects import ObjectModel
 
 Preset = Literal["fast", "paper", "quick"]
 
@@ -22,33 +23,80 @@ def synthesize(
     count: int = 400,
     out: Path,
     mesh: OptionalPath = None,
+    material: OptionalPath = None,
+    simplify_mm: float | None = None,
     intrinsics: OptionalPath = None,
+    views_like: OptionalPath = None,
+    domain: Literal["synthetic", "captured"] = "synthetic",
     seed: int = 0,
     workers: int = 2,
-    backend: Literal["analytic"] = "analytic",
+    backend: Literal["analytic", "path-traced"] = "analytic",
+    samples: int = 32,
+    executor: Literal["local", "ray"] = "local",
 ) -> None:
     """Render a training set: polarized images of the object, with exact poses and masks.
 
     Args:
         object: cup, fork, knife, bottle, or the name of the object in --mesh.
         count: frames; a set that was interrupted is continued.
-        out: session file to write.
+        out: session file to write; its manifest and a picture of how informative it is come beside it.
         mesh: PLY, OBJ or STL of the object, metres.
+        material: TOML file of what it is made of; that beside the mesh by default.
+        simplify_mm: render a mesh of fewer faces whose surface is nowhere further off than this.
         intrinsics: calibration.json of the camera to imitate; the paper's camera by default.
+        views_like: session whose poses of the object the views are distributed like.
+        domain: synthetic to train on; captured has a denser material, harder light, more noise, occlusion.
         seed: the same seed, the same frames.
-        workers: processes that render.
-        backend: analytic is Fresnel reflection of lights and environment, without shadows.
+        workers: processes that render, or Ray actors.
+        backend: analytic is Fresnel reflection of lights and environment, without shadows; path-traced is
+            Mitsuba 3, with shadows, inter-reflection and glass.
+        samples: paths per pixel, at least 16; path-traced only.
+        executor: ray uses the cluster that RAY_ADDRESS names, or starts one here.
     """
-    from s2p3.objects import named_object
-    from s2p3.synthesis import session_camera
+    from dataclasses import replace
+
+    from s2p3.synthesis import DOMAINS, Analytic, PathTraced, ViewsLike, session_camera
     from s2p3.synthesis import synthesize as render
 
-    del backend  # one so far; the choice is in the interface that both will share
+    at_least(1, workers=workers, count=count)
+    at_least(16, samples=samples)
+    at_least(0, seed=seed)
+    model = _prepared(object, mesh, material, simplify_mm)
+    chosen = DOMAINS[domain]
+    if views_like is not None:
+        chosen = replace(chosen, views=ViewsLike.of(views_like, model.name))
+    renderer = Analytic() if backend == "analytic" else PathTraced.here(samples)
+    if isinstance(renderer, PathTraced) and renderer.engine.note:
+        say(renderer.engine.note)
     with counting("synthesize") as report:
         figures = render(
-            named_object(object, mesh), count, session_camera(intrinsics), seed, out, workers, report
+            model, count, session_camera(intrinsics), seed, out, workers, report, chosen, renderer, executor
         )
     say(f"{out}: {count} frames; {figures}")
+
+
+def _prepared(name: str, mesh: Path | None, material: Path | None, simplify_mm: float | None) -> ObjectModel:
+    """The object to render; says what a mesh file was found to be."""
+    from dataclasses import replace
+
+    from s2p3.objects import named_object
+    from s2p3.simplify import simplify
+
+    model = named_object(name, mesh, material)
+    if mesh is not None:
+        size = f"{1000 * model.diameter:.1f} mm across, {len(model.faces)} faces, watertight"
+        say(f"{name}: {size}; {model.material} of index {model.refractive_index:g}")
+        proposal = model.proposed_symmetry()
+        if proposal.any and not model.symmetry.any:
+            say(f"{name}: {proposal}; if you agree, add to {mesh.with_suffix('.toml')}:\n{proposal.toml}")
+    if simplify_mm is None:
+        return model
+    fewer = simplify(model, simplify_mm / 1000)
+    say(
+        f"{name}: {len(fewer.model.faces)} of {len(model.faces)} faces, "
+        f"at most {1000 * fewer.error_m:.3f} mm off"
+    )
+    return replace(fewer.model, diameter=model.diameter)
 
 
 def train_detector(

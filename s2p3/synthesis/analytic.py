@@ -51,7 +51,9 @@ def shade(
         np.ascontiguousarray(mask),
         albedo if albedo is not None else np.full((1, 1), surface.albedo, np.float32),
         painted,
-        np.array([surface.refractive_index, surface.extinction, surface.gloss], np.float32),
+        np.array(
+            [surface.refractive_index, surface.extinction, surface.gloss, surface.kind != "matte"], np.float32
+        ),
         np.array([light.ambient, light.sky, light.ground, *light.up], np.float32),
         _lamps(light, surface.sharpness),
         np.ascontiguousarray(light.environment, dtype=np.float32),
@@ -84,7 +86,7 @@ def _shade(
     out: Image,
 ) -> None:
     height, width = mask.shape
-    n, k, gloss = surface[0], surface[1], surface[2]
+    n, k, gloss, polarizing = surface[0], surface[1], surface[2], surface[3]
     one, half, zero = np.float32(1), np.float32(0.5), np.float32(0)
     for i in range(height):
         for j in range(width):
@@ -120,7 +122,7 @@ def _shade(
             body = (albedo[i, j] if painted else albedo[0, 0]) * irradiance
             diffuse = body * (one - half * (r_s + r_p))
             specular = gloss * mirrored * half * (r_s + r_p)
-            polarized = half * (r_s - r_p) * (body - gloss * mirrored)  # positive along phi
+            polarized = polarizing * half * (r_s - r_p) * (body - gloss * mirrored)  # positive along phi
 
             shift = nz + (dx * nx + dy * ny) / (one + dz)
             ax, ay = nx - dx * shift, -(ny - dy * shift)

@@ -9,46 +9,36 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
+from s2p3.synthesis.views import Range, Views, ViewsLike
 
-from dataset import SE3, Intrinsics
-from s2p3 import object_meshes
-from s2p3.objects import ObjectModel
-from s2p3.rendering import Mesh
-from s2p3.synthesis.lighting import Light, Surface
-from s2p3.synthesis.scene import Clutter, SceneParameters
-
-Image = NDArray[np.float32]
-Range = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Views:
-    """Cameras on the upper hemisphere about the object, all around it."""
-
-    distance_m: Range = (0.28, 0.6)
-    elevation_deg: Range = (20.0, 80.0)
-    roll_deg: Range = (-25.0, 25.0)
-    offset: float = 0.45
-    """Largest distance of the object from the image's centre, in half image sides."""
+_ALL_AROUND = Views()
 
 
 @dataclass(frozen=True)
 class Domain:
-    """Ranges that `draw_scene` draws from."""
+    """Ranges that `draw_scene` draws from. Both backends read all of them, except where it says otherwise."""
 
-    views: Views = Views()
+    views: Views | ViewsLike = _ALL_AROUND
     specular_share: float = 0.75
-    """Share of scenes in which light coloured materials are prevailingly specular; steel always is."""
+    """Share of scenes in which materials without a given colour are prevailingly specular; metals always
+    are."""
     index_scale: Range = (0.95, 1.07)
     """Refractive index, relative to the object's."""
     dolp_scale: Range = (0.9, 1.0)
     lamps: tuple[int, int] = (1, 4)
+    lamp_glare: Range = (1.0, 10.0)
+    lamp_sharpness: Range = (4.0, 50.0)
+    ambient: Range = (0.1, 0.35)
+    """Irradiance from everywhere; analytic only."""
+    specular_sky: Range = (0.4, 1.3)
+    """Radiance of the surroundings in specular scenes."""
+    diffuse_sky: Range = (0.02, 0.08)
+    """The same in diffuse scenes, where analytic lamps light without being mirrored as much."""
+    matte_table_share: float = 0.3
+    """Share of scenes on an unpolarized background: cloth, paper."""
     table_gloss: Range = (0.0, 0.5)
     haze_dolp: Range = (0.0, 0.25)
-    """Largest additional degree of polarization of the background."""
+    """Largest additional degree of polarization of the background, where it is not matte."""
     clutter: tuple[int, int] = (0, 3)
     occluder_share: float = 0.2
     """Share of scenes with something between camera and object."""
@@ -63,149 +53,29 @@ class Domain:
 SYNTHETIC = Domain()
 """The domain that `synthesize` draws from unless told otherwise."""
 
+CAPTURED = Domain(
+    specular_share=0.9,
+    index_scale=(1.05, 1.085),
+    dolp_scale=(0.92, 0.97),
+    lamps=(3, 6),
+    lamp_glare=(3.0, 14.0),
+    lamp_sharpness=(20.0, 120.0),
+    ambient=(0.05, 0.3),
+    specular_sky=(0.3, 1.0),
+    diffuse_sky=(0.03, 0.12),
+    matte_table_share=0.1,
+    table_gloss=(0.3, 1.0),
+    haze_dolp=(0.1, 0.4),
+    clutter=(1, 4),
+    occluder_share=0.13,
+    blur_px=(0.6, 1.2),
+    level=(0.1, 0.3),
+    full_well=(8000.0, 16000.0),
+    read_noise=(12.0, 30.0),
+)
+"""A stand-in for captured images, wider than the gap within `SYNTHETIC`: a denser material (1.6 where the
+model says 1.5), harder and more lamps, glossier and more polarized backgrounds, leaking polarizers, blur,
+noise, and the object covered in about every seventh frame."""
 
-def draw_view(views: Views, model: ObjectModel, intrinsics: Intrinsics, rng: np.random.Generator) -> SE3:
-    """T_cam_obj of the object resting on the table, seen from somewhere on the upper hemisphere."""
-    azimuth = rng.uniform(0, 2 * np.pi)
-    low, high = np.sin(np.radians(views.elevation_deg))
-    elevation = np.arcsin(rng.uniform(low, high))
-    roll = np.radians(rng.uniform(*views.roll_deg))
-    outward = np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    level = np.stack(
-        [right, np.cross(-outward, right), -outward]
-    )  # rows: the camera's axes in the table's frame
-    upright = SE3.from_rotvec([0.0, 0.0, roll], np.zeros(3)).rotation @ level
-    half = 0.5 * np.array([intrinsics.width, intrinsics.height])
-    pixel = half - 0.5 + views.offset * half * rng.uniform(-1, 1, 2)
-    ray = intrinsics.rays(pixel)
-    axis = np.cross([0.0, 0.0, 1.0], ray)
-    sine = np.linalg.norm(axis)
-    turn = SE3.from_rotvec(axis / max(sine, 1e-12) * np.arcsin(sine), np.zeros(3)).rotation
-    return SE3(turn @ upright, rng.uniform(*views.distance_m) * ray)
-
-
-def draw_scene(
-    domain: Domain, model: ObjectModel, T_cam_obj: SE3, rng: np.random.Generator
-) -> SceneParameters:
-    """Everything else about a scene with the object seen at T_cam_obj."""
-    specular = model.material == "steel" or rng.random() < domain.specular_share
-    index = model.refractive_index * rng.uniform(*domain.index_scale)
-    surface = Surface(
-        index,
-        model.extinction,
-        albedo=_object_albedo(model.material, specular, rng),
-        gloss=rng.uniform(0.85, 1.0),
-        sharpness=float(np.exp(rng.uniform(np.log(15), np.log(200)))),
-    )
-    light = _light(rng.uniform(0.4, 1.3) if specular else rng.uniform(0.02, 0.08), domain, rng)
-    patches = int(rng.integers(2, 6))
-    return SceneParameters(
-        surface=surface,
-        light=light,
-        table=Surface(rng.uniform(1.35, 1.65), gloss=rng.uniform(*domain.table_gloss), sharpness=20.0),
-        texture=_texture(rng),
-        texture_m=rng.uniform(0.4, 1.5),
-        wall=_smooth(rng, (3, 24), 256, 0.03, 0.9),
-        haze_dolp=_smooth(rng, (patches,), patches, 0.0, rng.uniform(*domain.haze_dolp)),
-        haze_angle=_smooth(rng, (3,), 3, 0.0, np.pi),
-        clutter=_clutter(domain, model, T_cam_obj, rng),
-        dolp_scale=rng.uniform(*domain.dolp_scale),
-        blur_px=rng.uniform(*domain.blur_px),
-        level=rng.uniform(*domain.level),
-        full_well=rng.uniform(*domain.full_well),
-        read_noise=rng.uniform(*domain.read_noise),
-    )
-
-
-def _object_albedo(material: str, specular: bool, rng: np.random.Generator) -> float:
-    if material == "steel":
-        return 0.0
-    if specular:
-        return float(np.exp(rng.uniform(np.log(0.001), np.log(0.012))))
-    return float(rng.uniform(0.2, 0.8))
-
-
-def _light(sky: float, domain: Domain, rng: np.random.Generator) -> Light:
-    count = int(rng.integers(domain.lamps[0], domain.lamps[1] + 1))
-    directions = rng.normal(size=(count, 3))
-    directions[:, 2] = np.abs(directions[:, 2]) + 0.15
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    map_ = _smooth(rng, (4, 8, 16), 64, 0.25, 1.6)
-    return Light(
-        up=np.array([0.0, 0.0, 1.0]),
-        ambient=rng.uniform(0.1, 0.35),
-        sky=sky,
-        ground=sky * rng.uniform(0.35, 0.9),
-        directions=directions,
-        irradiance=rng.uniform(0.05, 0.4, count),
-        glare=rng.uniform(1.0, 10.0, count),
-        sharpness=rng.uniform(4.0, 50.0, count),
-        environment=np.concatenate([map_, map_[:, ::-1]], axis=1),  # mirrored: no seam
-        R_world_here=np.eye(3),
-    )
-
-
-def _texture(rng: np.random.Generator, size: int = 256) -> Image:
-    """An albedo of stripes, checks or blotches over fractal noise."""
-    noise = _smooth(rng, (4, 8, 16, 32, 64, 128), size, 0.0, 1.0)
-    y, x = np.mgrid[:size, :size].astype(np.float32) / size
-    angle, frequency = rng.uniform(0, np.pi), rng.uniform(3, 20)
-    wave = np.sin(2 * np.pi * frequency * (x * np.cos(angle) + y * np.sin(angle)) + rng.uniform(0, 6) * noise)
-    other = np.sin(2 * np.pi * frequency * (y * np.cos(angle) - x * np.sin(angle)))
-    pattern = (noise, 0.5 + 0.5 * wave, 0.5 + 0.5 * np.sign(wave), 0.5 + 0.5 * np.sign(wave * other))
-    figure = pattern[rng.integers(len(pattern))]
-    share = rng.uniform(0, 0.8)
-    low, high = np.sort(rng.uniform(0.02, 0.65, 2))
-    return (low + (high - low) * (share * figure + (1 - share) * noise)).astype(np.float32)
-
-
-def _smooth(rng: np.random.Generator, cells: tuple[int, ...], size: int, low: float, high: float) -> Image:
-    """(size, size) noise with so many cells per octave, coarse ones stronger, stretched to [low, high]."""
-    out = np.zeros((size, size), np.float32)
-    for octave, count in enumerate(cells):
-        grid = rng.random((count, count), dtype=np.float32)
-        out += cv2.resize(grid, (size, size), interpolation=cv2.INTER_CUBIC) * np.float32(0.6**octave)
-    least, most = float(out.min()), float(out.max())
-    scaled: Image = np.float32(low) + (out - least) * np.float32((high - low) / max(most - least, 1e-9))
-    return scaled
-
-
-def _clutter(
-    domain: Domain, model: ObjectModel, T_cam_obj: SE3, rng: np.random.Generator
-) -> tuple[Clutter, ...]:
-    footprint = float(np.linalg.norm(model.vertices[:, :2], axis=1).max())
-    items = []
-    for _ in range(int(rng.integers(domain.clutter[0], domain.clutter[1] + 1))):
-        mesh, radius, height = _item(0.03, 0.12, rng)
-        distance = footprint + radius + rng.uniform(0.005, 0.15)
-        around = rng.uniform(0, 2 * np.pi)
-        place = [distance * np.cos(around), distance * np.sin(around), height / 2]
-        items.append(
-            Clutter(mesh, SE3.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)], place), _item_surface(rng))
-        )
-    if rng.random() < domain.occluder_share:
-        mesh, _, _ = _item(0.2 * model.diameter, 0.55 * model.diameter, rng)
-        target = model.vertices[rng.integers(len(model.vertices))]
-        eye = T_cam_obj.inverse().translation
-        between = model.resting.apply(target + rng.uniform(0.25, 0.55) * (eye - target))
-        items.append(Clutter(mesh, SE3.from_rotvec(rng.normal(size=3), between), _item_surface(rng)))
-    return tuple(items)
-
-
-def _item(smallest: float, largest: float, rng: np.random.Generator) -> tuple[Mesh, float, float]:
-    """A box or an ellipsoid, the radius of its footprint and its height."""
-    x, y, z = rng.uniform(smallest, largest, 3)
-    shape = object_meshes.box if rng.random() < 0.5 else object_meshes.ellipsoid
-    return Mesh.from_arrays(*shape((x, y, z))), 0.5 * float(np.hypot(x, y)), float(z)
-
-
-def _item_surface(rng: np.random.Generator) -> Surface:
-    return Surface(
-        rng.uniform(1.3, 2.0),
-        albedo=rng.uniform(0.0, 0.7),
-        gloss=rng.uniform(0.0, 1.0),
-        sharpness=rng.uniform(8, 80),
-    )
+DOMAINS = {"synthetic": SYNTHETIC, "captured": CAPTURED}
+"""By the names the command line knows."""

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
+from typing import Protocol
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from dataset import SE3, Intrinsics
-from dataset.polarimetry import Stokes, sample_mosaic, white_level
+from dataset.polarimetry import Stokes
 from s2p3.objects import ObjectModel
 from s2p3.rendering import Mesh, Raster, projected_region, rasterize
-from s2p3.synthesis.analytic import shade
 from s2p3.synthesis.lighting import Light, Surface
 
 Image = NDArray[np.float32]
-Image16 = NDArray[np.uint16]
 
-_COARSE = 4
-_NOISE_COUNT = 1 << 22
+_COARSE = 4  # pixels between which smooth maps are interpolated
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +40,8 @@ class SceneParameters:
         light: in the table's frame.
         table: its surface; the albedo comes from the texture.
         texture: (n, n) float32 albedo of `texture_m` x `texture_m` metres of table, mirrored beyond.
-        wall: (n, n) float32 radiance of what lies behind the table, stretched over the image.
+        wall: (n, n) float32 radiance of what lies behind the table: stretched over the image (analytic), or
+            around the horizon (path-traced).
         haze_dolp, haze_angle: (m, m) float32, stretched over the image: degree and angle (radians) of
             additional polarization of table and wall, so that polarized does not mean object.
         clutter: other things; they may occlude the object.
@@ -71,6 +69,100 @@ class SceneParameters:
 
 
 @dataclass(frozen=True, eq=False)
+class Layer:
+    """One thing as the camera sees it: its truth within its block of the image, and where in the block it is
+    in front of the layers before it."""
+
+    raster: Raster
+    front: NDArray[np.bool_]
+    surface: Surface
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene and who looks at it; what can be seen follows exactly, whoever renders it.
+
+    Attributes:
+        model: the object; it rests on the table.
+        T_cam_obj: its pose.
+        intrinsics: the camera, a pinhole.
+        parameters: everything else.
+    """
+
+    model: ObjectModel
+    T_cam_obj: SE3
+    intrinsics: Intrinsics
+    parameters: SceneParameters
+
+    @cached_property
+    def rays(self) -> Image:
+        """(h, w, 3) float32 unit viewing rays."""
+        return self.intrinsics.rays().astype(np.float32)
+
+    @cached_property
+    def T_cam_table(self) -> SE3:
+        """Where the table is."""
+        return self.T_cam_obj @ self.model.resting.inverse()
+
+    @cached_property
+    def layers(self) -> tuple[Layer, ...]:
+        """The object, then the clutter; later ones cover earlier ones."""
+        things = [(self.model.mesh, self.T_cam_obj, self.parameters.surface)]
+        for item in self.parameters.clutter:
+            things.append((item.mesh, self.T_cam_table @ item.T_table_item, item.surface))
+        depth = np.full((self.intrinsics.height, self.intrinsics.width), np.inf, np.float32)
+        layers = []
+        for mesh, T_cam_item, surface in things:
+            region = projected_region(mesh, T_cam_item, self.intrinsics)
+            raster = rasterize(mesh, T_cam_item, self.intrinsics, region)
+            front = raster.mask & (raster.depth < depth[raster.window])
+            depth[raster.window][front] = raster.depth[front]
+            layers.append(Layer(raster, front, surface))
+        return tuple(layers)
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """(h, w) bool: where the object is visible."""
+        return self._owner == 1
+
+    @property
+    def covered(self) -> NDArray[np.bool_]:
+        """(h, w) bool: where anything stands before table and wall."""
+        return self._owner > 0
+
+    @property
+    def visible_fraction(self) -> float:
+        """Visible share of the object's pixels in the image; 0 where it is not in the image."""
+        seen = int(self.layers[0].raster.mask.sum())
+        return float(self.mask.sum()) / seen if seen else 0.0
+
+    @cached_property
+    def _owner(self) -> NDArray[np.uint8]:
+        """(h, w): 0 the background, 1 the object, 2 and up the clutter."""
+        owner = np.zeros((self.intrinsics.height, self.intrinsics.width), np.uint8)
+        for number, layer in enumerate(self.layers, start=1):
+            owner[layer.raster.window][layer.front] = number
+        return owner
+
+
+class Backend(Protocol):
+    """What turns a scene into light."""
+
+    @property
+    def name(self) -> str:
+        """As the command line calls it."""
+        ...
+
+    def describe(self) -> dict[str, object]:
+        """Everything its result depends on besides scene and seed, for JSON."""
+        ...
+
+    def radiance(self, scene: Scene, seed: int) -> Image:
+        """(3, h, w) float32 S0, S1, S2 that reach the camera, in any unit, without the background's haze."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
 class SceneImage:
     """A rendered scene with its truth.
 
@@ -87,171 +179,45 @@ class SceneImage:
     visible_fraction: float
 
 
-def render_scene(
-    model: ObjectModel,
-    T_cam_obj: SE3,
-    intrinsics: Intrinsics,
-    parameters: SceneParameters,
-    rays: Image | None = None,
-) -> SceneImage:
-    """Render the object resting on the table, seen at T_cam_obj.
+def render(scene: Scene, backend: Backend, seed: int = 0) -> SceneImage:
+    """What the camera measures but for the sensor's noise: light, haze, optics and exposure.
 
     Args:
-        rays: (h, w, 3) float32, `intrinsics.rays()` where the caller has them already.
+        seed: of whatever the backend samples.
     """
-    if rays is None:
-        rays = intrinsics.rays().astype(np.float32)
-    T_cam_table = T_cam_obj @ model.resting.inverse()
-    light = parameters.light.turned(T_cam_table)
-    image = _background(rays, T_cam_table, parameters, light)
-    raster = rasterize(model.mesh, T_cam_obj, intrinsics, projected_region(model.mesh, T_cam_obj, intrinsics))
-    _paint(
-        image,
-        raster,
-        raster.mask,
-        shade(raster.normals, rays[raster.window], raster.mask, parameters.surface, light),
+    image = backend.radiance(scene, seed)
+    _add_haze(image, scene)
+    return SceneImage(
+        _camera(image, scene.parameters), scene.layers[0].raster, scene.mask, scene.visible_fraction
     )
-    depth = np.full(image.shape[1:], np.inf, np.float32)
-    depth[raster.window][raster.mask] = raster.depth[raster.mask]
-    mask = np.isfinite(depth)
-    for item in parameters.clutter:
-        T_cam_item = T_cam_table @ item.T_table_item
-        other = rasterize(
-            item.mesh, T_cam_item, intrinsics, projected_region(item.mesh, T_cam_item, intrinsics)
-        )
-        front = other.mask & (other.depth < depth[other.window])
-        _paint(image, other, front, shade(other.normals, rays[other.window], front, item.surface, light))
-        depth[other.window][front] = other.depth[front]
-        mask[other.window][front] = False
-    seen = int(raster.mask.sum())
-    return SceneImage(_camera(image, parameters), raster, mask, float(mask.sum()) / seen if seen else 0.0)
 
 
-def expose(stokes: Stokes, parameters: SceneParameters, bits: int, rng: np.random.Generator) -> Image16:
-    """A raw mosaic (2h, 2w) uint16 of a monochrome polarization sensor: shot and read noise, quantization."""
-    intensity = sample_mosaic(stokes, "mono")
-    start = int(rng.integers(_NOISE_COUNT - intensity.size))
-    out = np.empty(intensity.shape, np.uint16)
-    _read_out(
-        intensity.ravel(),
-        _noise()[start : start + intensity.size],
-        np.float32(parameters.full_well),
-        np.float32(parameters.read_noise**2),
-        np.float32(white_level(bits)),
-        out.ravel(),
-    )
-    return out
+def stretched(map_: Image, height: int, width: int) -> Image:
+    """A smooth map (m, n) enlarged to (height, width)."""
+    return cv2.resize(map_, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32, copy=False)
 
 
-@lru_cache(maxsize=1)
-def _noise() -> Image:
-    """A long row of normal deviates; each frame reads it from another place: cheaper than drawing."""
-    return np.random.default_rng(0).standard_normal(_NOISE_COUNT, dtype=np.float32)
-
-
-def _paint(image: Image, raster: Raster, where: NDArray[np.bool_], stokes: Image) -> None:
-    for channel, values in zip(image, stokes, strict=True):
-        channel[raster.window][where] = values[where]
-
-
-def _background(rays: Image, T_cam_table: SE3, parameters: SceneParameters, light: Light) -> Image:
-    """(3, h, w): the table where rays meet it, the wall behind elsewhere, with the haze of polarization.
-
-    Light on the table changes slowly over the image and is linear in its albedo: it is shaded on every fourth
-    pixel, for black and for white, and interpolated.
-    """
-    height, width = rays.shape[:2]
-    T_table_cam = T_cam_table.inverse()
-    albedo = np.zeros((height, width), np.float32)
-    _table_albedo(
-        rays,
-        T_table_cam.rotation.astype(np.float32),
-        T_table_cam.translation.astype(np.float32),
-        parameters.texture,
-        np.float32(parameters.texture.shape[0] / parameters.texture_m),
-        albedo,
-    )
-    size = (width // _COARSE, height // _COARSE)
-    coarse = cv2.resize(rays, size, interpolation=cv2.INTER_AREA).astype(np.float32, copy=False)
-    normals = np.broadcast_to(T_cam_table.rotation[:, 2].astype(np.float32), coarse.shape)
-    everywhere = np.ones(coarse.shape[:2], bool)
-    black, white = (
-        shade(
-            normals, coarse, everywhere, parameters.table, light, np.full(coarse.shape[:2], tone, np.float32)
-        )
-        for tone in (0.0, 1.0)
-    )
-    image = np.stack(
-        [albedo * _stretched(w - b, rays) + _stretched(b, rays) for b, w in zip(black, white, strict=True)]
-    )
-    wall = albedo == 0
-    image[0][wall] = _stretched(parameters.wall, rays)[wall]
-    image[1:, wall] = 0
-    doubled = 2 * _stretched(parameters.haze_angle, coarse)
-    strength = _stretched(parameters.haze_dolp, coarse)
-    image[1] += image[0] * _stretched(strength * np.cos(doubled), rays)
-    image[2] += image[0] * _stretched(strength * np.sin(doubled), rays)
-    return image
-
-
-def _stretched(map_: Image, like: Image) -> Image:
-    """A smooth map (m, n) enlarged to the height and width of another array."""
-    size = (like.shape[1], like.shape[0])
-    return cv2.resize(map_, size, interpolation=cv2.INTER_LINEAR).astype(np.float32, copy=False)
+def _add_haze(image: Image, scene: Scene) -> None:
+    """Polarizes what lies behind object and clutter further; it stays no more polarized than bright."""
+    parameters, (height, width) = scene.parameters, image.shape[1:]
+    if not parameters.haze_dolp.any():
+        return
+    background = image[:, ~scene.covered]
+    size = (height // _COARSE, width // _COARSE)
+    doubled = 2 * stretched(parameters.haze_angle, *size)
+    strength = stretched(parameters.haze_dolp, *size)
+    for channel, part in ((1, strength * np.cos(doubled)), (2, strength * np.sin(doubled))):
+        background[channel] += background[0] * stretched(part, height, width)[~scene.covered]
+    image[:, ~scene.covered] = background
 
 
 def _camera(image: Image, parameters: SceneParameters) -> Stokes:
     """Exposure, leaking polarizers and blur; light stays physical: no more polarized than bright."""
+    excess = np.hypot(image[1], image[2]) / np.maximum(image[0], 1e-9)
+    image[1:] /= np.maximum(excess, 1)
     if parameters.blur_px > 0:
         for channel in image:
             cv2.GaussianBlur(channel, (0, 0), parameters.blur_px, dst=channel)
     image *= np.float32(2 * parameters.level / max(float(image[0].mean()), 1e-9))
     image[1:] *= np.float32(parameters.dolp_scale)
     return Stokes(image[0], image[1], image[2], np.ones(image.shape[1:], dtype=bool))
-
-
-@numba.njit(cache=True)
-def _read_out(
-    intensity: Image, noise: Image, full_well: float, read_variance: float, white: float, out: Image16
-) -> None:
-    for i in range(intensity.size):
-        electrons = max(intensity[i], np.float32(0)) * full_well
-        electrons += noise[i] * np.sqrt(electrons + read_variance)
-        out[i] = np.uint16(min(max(electrons / full_well * white + np.float32(0.5), np.float32(0)), white))
-
-
-@numba.njit(cache=True, fastmath=True)
-def _table_albedo(
-    rays: Image, R_table_cam: Image, t_table_cam: Image, texture: Image, texels_per_m: float, out: Image
-) -> None:
-    """Albedo (h, w) of the plane z = 0 by mirrored bilinear look-up; untouched where no ray meets it."""
-    size = texture.shape[0]
-    for i in range(rays.shape[0]):
-        for j in range(rays.shape[1]):
-            dx, dy, dz = rays[i, j, 0], rays[i, j, 1], rays[i, j, 2]
-            down = R_table_cam[2, 0] * dx + R_table_cam[2, 1] * dy + R_table_cam[2, 2] * dz
-            if down > np.float32(-0.01):
-                continue
-            reach = -t_table_cam[2] / down
-            x = t_table_cam[0] + reach * (
-                R_table_cam[0, 0] * dx + R_table_cam[0, 1] * dy + R_table_cam[0, 2] * dz
-            )
-            y = t_table_cam[1] + reach * (
-                R_table_cam[1, 0] * dx + R_table_cam[1, 1] * dy + R_table_cam[1, 2] * dz
-            )
-            u, v = _mirrored(x * texels_per_m, size), _mirrored(y * texels_per_m, size)
-            a, b = int(u), int(v)
-            s, t = u - np.float32(a), v - np.float32(b)
-            near = texture[b, a] * (1 - s) + texture[b, a + 1] * s
-            far = texture[b + 1, a] * (1 - s) + texture[b + 1, a + 1] * s
-            out[i, j] = max(near * (1 - t) + far * t, np.float32(1e-4))
-
-
-@numba.njit(cache=True, fastmath=True, inline="always")
-def _mirrored(position: float, size: int) -> float:
-    """A position folded into [0, size - 1), back and forth; the texture's middle is at 0."""
-    span = np.float32(size - 1.001)
-    folded = np.abs(position + np.float32(0.5) * span) / span
-    whole = np.floor(folded)
-    part = folded - whole
-    return (part if int(whole) % 2 == 0 else np.float32(1) - part) * span

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from dataset import ToolkitError
 from s2p3 import object_meshes, objects
+from s2p3.materials import Material
 
 
 @pytest.mark.parametrize(
@@ -90,7 +91,7 @@ def _export(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
 @pytest.mark.parametrize("suffix", ["ply", "obj", "stl"])
 def test_load_reads_back_what_was_exported(tmp_path: Path, suffix: str) -> None:
     vertices, faces = object_meshes.box((0.1, 0.05, 0.02))
-    model = objects.load(_export(tmp_path / f"block.{suffix}", vertices, faces), refractive_index=1.4)
+    model = objects.load(_export(tmp_path / f"block.{suffix}", vertices, faces), made_of=Material(refractive_index=1.4))
     assert (model.name, model.refractive_index, len(model.faces)) == ("block", 1.4, 12)
     assert model.diameter == pytest.approx(np.linalg.norm([0.1, 0.05, 0.02]), rel=1e-5)
 

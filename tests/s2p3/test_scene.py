@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,22 +14,38 @@ from dataset import Intrinsics, ToolkitError
 from dataset.polarimetry import decode
 from dataset.session import Session
 from s2p3 import objects
+from s2p3.objects import ObjectModel
 from s2p3.rendering import rasterize
 from s2p3.synthesis import (
     SYNTHETIC,
+    Analytic,
+    Domain,
+    Recipe,
+    Scene,
+    SceneImage,
     Views,
-    draw_frame,
     draw_scene,
-    draw_view,
-    render_scene,
+    render,
     session_camera,
     synthesize,
 )
-from s2p3.synthesis.informativeness import measure
-from s2p3.synthesis.scene import expose
+from s2p3.synthesis.frames import Drawn
+from s2p3.synthesis.informativeness import Informativeness, measure
+from s2p3.synthesis.sensor import expose
 
 SMALL = Intrinsics(np.array([[120.0, 0, 79.0], [0, 121.0, 63.5], [0, 0, 1]]), np.zeros(0), 128, 160)
 CUP = objects.build("cup")
+
+
+def _frame(model: ObjectModel, domain: Domain, seed: int, index: int) -> tuple[Drawn, SceneImage]:
+    drawn = Recipe(model, SMALL, domain, Analytic(), seed).draw(index)
+    return drawn, render(drawn.scene, Analytic())
+
+
+def _scene(seed: int) -> tuple[Scene, np.random.Generator]:
+    rng = np.random.default_rng(seed)
+    T_cam_obj = SYNTHETIC.views.draw(CUP, SMALL, rng)
+    return Scene(CUP, T_cam_obj, SMALL, draw_scene(SYNTHETIC, CUP, T_cam_obj, rng)), rng
 
 
 def test_views_lie_on_the_upper_hemisphere_within_their_ranges() -> None:
@@ -35,7 +53,7 @@ def test_views_lie_on_the_upper_hemisphere_within_their_ranges() -> None:
     rng = np.random.default_rng(0)
     azimuths = []
     for _ in range(200):
-        T_obj_cam = draw_view(views, CUP, SMALL, rng).inverse()
+        T_obj_cam = views.draw(CUP, SMALL, rng).inverse()
         eye = T_obj_cam.translation
         distance = np.linalg.norm(eye)
         assert 0.4 <= distance <= 0.5
@@ -51,8 +69,8 @@ def test_views_lie_on_the_upper_hemisphere_within_their_ranges() -> None:
 @pytest.mark.parametrize("name", objects.NAMES)
 def test_a_frame_shows_the_object_where_its_truth_says(name: str) -> None:
     model = objects.build(name)
-    T_cam_obj, _, image, _ = draw_frame(model, SMALL, SYNTHETIC, seed=1, index=0)
-    full = rasterize(model.mesh, T_cam_obj, SMALL).mask
+    drawn, image = _frame(model, SYNTHETIC, seed=1, index=0)
+    full = rasterize(model.mesh, drawn.scene.T_cam_obj, SMALL).mask
     assert not (image.mask & ~full).any()
     assert image.visible_fraction == pytest.approx(image.mask.sum() / full.sum())
     assert image.visible_fraction >= SYNTHETIC.smallest_visible_fraction
@@ -64,7 +82,7 @@ def test_a_frame_shows_the_object_where_its_truth_says(name: str) -> None:
 def test_clutter_occludes_and_the_background_is_sometimes_polarized() -> None:
     hidden, polarized = 0, 0
     for index in range(12):
-        *_, image, _ = draw_frame(CUP, SMALL, SYNTHETIC, seed=2, index=index)
+        _, image = _frame(CUP, SYNTHETIC, seed=2, index=index)
         hidden += image.visible_fraction < 0.999
         polarized += np.quantile(image.stokes.dolp[~image.mask], 0.9) > 0.1
     assert 0 < hidden < 12
@@ -72,11 +90,9 @@ def test_clutter_occludes_and_the_background_is_sometimes_polarized() -> None:
 
 
 def test_the_sensor_adds_the_noise_it_is_given() -> None:
-    rng = np.random.default_rng(3)
-    T_cam_obj = draw_view(SYNTHETIC.views, CUP, SMALL, rng)
-    parameters = draw_scene(SYNTHETIC, CUP, T_cam_obj, rng)
-    parameters = replace(parameters, full_well=1000.0, read_noise=5.0, level=0.15)
-    stokes = render_scene(CUP, T_cam_obj, SMALL, parameters).stokes
+    scene, rng = _scene(3)
+    parameters = replace(scene.parameters, full_well=1000.0, read_noise=5.0, level=0.15)
+    stokes = render(replace(scene, parameters=parameters), Analytic()).stokes
     assert float(stokes.s0.mean()) == pytest.approx(0.3, rel=1e-4)
     frames = np.stack([expose(stokes, parameters, 12, rng) for _ in range(60)]).astype(np.float64)
     mean, variance = frames.mean(axis=0) / 4095, frames.var(axis=0) / 4095**2
@@ -91,25 +107,27 @@ def test_the_sensor_adds_the_noise_it_is_given() -> None:
 
 
 def test_the_captured_domain_is_within_reach_of_the_parameters() -> None:
-    rng = np.random.default_rng(4)
-    T_cam_obj = draw_view(SYNTHETIC.views, CUP, SMALL, rng)
-    parameters = replace(draw_scene(SYNTHETIC, CUP, T_cam_obj, rng), clutter=(), blur_px=0.0, dolp_scale=1.0)
-    plain = render_scene(CUP, T_cam_obj, SMALL, parameters)
-    leaking = render_scene(CUP, T_cam_obj, SMALL, replace(parameters, dolp_scale=0.95))
+    scene, _ = _scene(4)
+    parameters = replace(scene.parameters, clutter=(), blur_px=0.0, dolp_scale=1.0)
+    plain = render(replace(scene, parameters=parameters), Analytic())
+    leaking = render(replace(scene, parameters=replace(parameters, dolp_scale=0.95)), Analytic())
     np.testing.assert_allclose(leaking.stokes.s1, 0.95 * plain.stokes.s1, atol=1e-6)
     denser = replace(parameters, surface=replace(parameters.surface, refractive_index=1.6))
-    other = render_scene(CUP, T_cam_obj, SMALL, denser).stokes
+    other = render(replace(scene, parameters=denser), Analytic()).stokes
     assert np.abs(other.dolp - plain.stokes.dolp)[plain.mask].max() > 0.01
 
 
 def test_informativeness_tells_polarization_from_its_absence() -> None:
-    T_cam_obj, _, image, _ = draw_frame(CUP, SMALL, replace(SYNTHETIC, specular_share=1.0), seed=5, index=0)
-    normals = rasterize(CUP.mesh, T_cam_obj, SMALL).normals
+    drawn, image = _frame(CUP, replace(SYNTHETIC, specular_share=1.0), seed=5, index=0)
+    normals = rasterize(CUP.mesh, drawn.scene.T_cam_obj, SMALL).normals
     stokes = image.stokes.stack()
     good = measure(stokes, normals, image.mask, SMALL.K, 1.5)
     assert good is not None
     assert good.prior_error_deg < 0.6 * good.chance_error_deg
     assert good.dolp_residual < 0.8 * good.dolp_residual_shuffled
+    assert np.argmax(np.array(good.prior_within) > 0.5) + 1 == pytest.approx(good.prior_error_deg, abs=1.0)
+    assert (np.diff(good.prior_within) >= 0).all()
+    assert Informativeness.from_json(good.to_json()) == good
     stokes[1:] = 0
     nothing = measure(stokes, normals, image.mask, SMALL.K, 1.5)
     assert nothing is not None
@@ -125,16 +143,21 @@ def test_a_set_is_a_session_with_its_truth(tmp_path: Path) -> None:
     assert seen == [(1, 3), (2, 3), (3, 3)]
     assert figures.images == 3
     assert "prior" in str(figures)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["set.h5"]
+    beside = ["set.h5", "set.informativeness.png", "set.manifest.json"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == beside
+    stored = json.loads((tmp_path / "set.manifest.json").read_text())
+    assert Informativeness.from_json(json.dumps(stored["informativeness"])) == figures
+    assert cv2.imread(str(tmp_path / "set.informativeness.png")).std() > 10
     with Session.open(path) as session:
         assert len(session) == 3
         np.testing.assert_allclose(session.working_intrinsics.K, SMALL.K, atol=1e-9)
         truth = session.object_poses("cup")
         assert session.object("cup").refractive_index == 1.5
         for i in range(3):
-            T_cam_obj, parameters, image, rng = draw_frame(CUP, SMALL, SYNTHETIC, 7, i)
-            np.testing.assert_array_equal(session.raw(i), expose(image.stokes, parameters, 12, rng))
-            np.testing.assert_allclose(truth.T_cam_obj[i].as_matrix(), T_cam_obj.as_matrix())
+            drawn, image = _frame(CUP, SYNTHETIC, 7, i)
+            raw = expose(image.stokes, drawn.scene.parameters, 12, drawn.noise)
+            np.testing.assert_array_equal(session.raw(i), raw)
+            np.testing.assert_allclose(truth.T_cam_obj[i].as_matrix(), drawn.scene.T_cam_obj.as_matrix())
             np.testing.assert_array_equal(truth.mask(i), image.mask)
             x, y, w, h = truth.bbox_xywh[i].astype(int)
             assert image.mask[y : y + h, x : x + w].sum() == image.mask.sum()

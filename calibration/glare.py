@@ -2,8 +2,8 @@
 another.
 
 Light that a glossy print reflects like a mirror is polarized, most of all near Brewster's angle; the board's
-own diffuse light is hardly so. Behind a polarizer across it the glare is gone: that is one of the four angle images,
-or nearly, and everywhere the smallest intensity over all angles, S0 (1 - DoLP) / 2.
+own diffuse light is hardly so. Behind a polarizer across it the glare is gone: that is one of the four angle
+images, or nearly, and everywhere the smallest intensity over all angles, S0 (1 - DoLP) / 2.
 """
 
 from __future__ import annotations

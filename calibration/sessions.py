@@ -135,6 +135,7 @@ def time_offset_from_session(
         intrinsics.intrinsics,
         hand_eye.T_tcp_cam,
         hand_eye.T_base_board,
+        hand_eye.covariance,
     )
     clocks_s = float(np.median(session.time_sigma_s[chosen]))
     return replace(result, sigma_s=float(np.hypot(result.sigma_s, clocks_s)))

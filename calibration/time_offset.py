@@ -1,8 +1,13 @@
-"""The constant delay between camera and arm, from pictures of the board taken in motion."""
+"""The constant delay between camera and arm, from pictures of the board taken in motion.
+
+First by correlation of how fast camera and arm turn, which needs no calibration (`calibration.streams`), and
+by how far the board seems to move; then refined on reprojection together with the hand-eye transforms, within
+their covariance, and with the arm's noise in the model.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +15,12 @@ from numpy.typing import NDArray
 from calibration.board import BoardSpec
 from calibration.bundle import Floats, Observations
 from calibration.detection import Detection
+from calibration.hand_eye_model import SCALE, TRANSFORMS, HandEyeState, TimedArm, fit
+from calibration.intrinsics import board_pose
+from calibration.streams import RANGE_S, ArmTrace, Correlation, correlate_turning
 from dataset.errors import CalibrationError
 from dataset.intrinsics import Intrinsics
 from dataset.transforms import SE3, interpolate_poses
-
-RANGE_S = 0.6
-"""Offsets searched, either way (our choice: a trigger, a network and a buffer stay well below)."""
 
 MIN_FRAMES = 8
 _SCAN_STEP_S = 0.01
@@ -38,6 +43,7 @@ class TimeOffsetResult:
         speed_px_s: (N,) how fast the corners moved.
         scan_s, scan_px: (K,) the median corner error over the range searched.
         used: (N,) frames that entered the estimate.
+        correlation: of the angular speeds; None when too few frames lie close together, or nothing turns.
     """
 
     offset_s: float
@@ -49,6 +55,7 @@ class TimeOffsetResult:
     scan_s: Floats
     scan_px: Floats
     used: NDArray[np.bool_]
+    correlation: Correlation | None
 
 
 def estimate_time_offset(
@@ -60,6 +67,7 @@ def estimate_time_offset(
     intrinsics: Intrinsics,
     T_tcp_cam: SE3,
     T_base_board: SE3,
+    hand_eye_covariance: Floats | None = None,
 ) -> TimeOffsetResult:
     """The dt that makes the board stand still: minimises reprojection with the arm's pose at mid exposure +
     dt.
@@ -70,6 +78,8 @@ def estimate_time_offset(
         trace: M poses T_base_tcp.
         detections: N, one a frame, corners in mosaic pixels.
         spec, intrinsics, T_tcp_cam, T_base_board: as calibrated at rest.
+        hand_eye_covariance: (12, 12) of both transforms' twists; they are refined with the offset when given,
+            and held fixed otherwise.
 
     Raises:
         CalibrationError: too few frames inside the trace, too little motion to tell, or no offset within
@@ -81,6 +91,9 @@ def estimate_time_offset(
     scan = np.arange(-RANGE_S, RANGE_S + 0.5 * _SCAN_STEP_S, _SCAN_STEP_S)
     errors = np.array([problem.median_error(dt) for dt in scan])
     offset = float(scan[np.argmin(errors)])
+    correlation = _correlate(problem, detections, spec)
+    if correlation is not None and problem.median_error(correlation.best_s) < errors.min():
+        offset = correlation.best_s
     if abs(offset) > RANGE_S - 1.5 * _SCAN_STEP_S:
         raise CalibrationError(
             f"time offset: no offset within {RANGE_S:g} s explains the pictures; check that the clocks were"
@@ -115,6 +128,9 @@ def estimate_time_offset(
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         alone = np.where(frame.speed > _MIN_SPEED_PX_S, offset - frame.gradient / frame.information, np.nan)
+    if hand_eye_covariance is not None:
+        offset, sigma = _refined(problem, offset, frame.used, T_base_board, hand_eye_covariance)
+        frame = problem.frames(offset)
     before = problem.frames(0.0)
     return TimeOffsetResult(
         offset_s=offset,
@@ -126,7 +142,35 @@ def estimate_time_offset(
         scan_s=scan,
         scan_px=errors,
         used=frame.used,
+        correlation=correlation,
     )
+
+
+def _correlate(problem: _Problem, detections: list[Detection], spec: BoardSpec) -> Correlation | None:
+    order = np.argsort(problem.mid_s)
+    seen = SE3.stack([board_pose(detections[i], spec, problem.intrinsics) for i in order])
+    return correlate_turning(problem.mid_s[order], seen, ArmTrace(problem.trace_s, problem.trace))
+
+
+def _refined(
+    problem: _Problem, offset: float, used: NDArray[np.bool_], T_base_board: SE3, covariance: Floats
+) -> tuple[float, float]:
+    """The offset and its standard deviation, refined with both transforms and the noise levels."""
+    state = HandEyeState(
+        "eye_in_hand",
+        problem.T_tcp_cam,
+        T_base_board,
+        problem.intrinsics,
+        problem.trace[:1],
+        np.zeros((int(used.sum()), 6)),
+        moving=TimedArm(ArmTrace(problem.trace_s, problem.trace), problem.mid_s[used]),
+    ).at_offset(offset)
+    free = state.free(offset=True)
+    information = np.zeros((len(free), len(free)))
+    information[TRANSFORMS, TRANSFORMS] = np.linalg.inv(covariance)
+    found = fit(replace(state, expected=state), problem.observations.of_views(used), free, information)
+    place = int(np.count_nonzero(free[:SCALE]))  # after the transforms: the scale is not free
+    return found.state.offset_s, float(np.sqrt(found.solution.covariance[place, place]))
 
 
 @dataclass(frozen=True, eq=False)

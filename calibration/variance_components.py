@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 PRIOR_LOG_SIGMA = 1.5
 """Standard deviation of a source's log standard deviation about its typical value: a factor of 4.5."""
 
+_LBFGS = {"maxiter": 60}
+_REACH = 7.0  # of a log standard deviation: a factor of a thousand, beyond which matrices turn singular
 _FLOOR = 1e-14 * np.eye(6)
 _TAILS = (3.0, 5.0, 9.0, 20.0, 100.0)  # degrees of freedom of Student's t; 100 is as good as Gaussian
 
@@ -77,7 +79,8 @@ def estimate_sigmas(
         gradient = by_variance * variance + off / PRIOR_LOG_SIGMA
         return 0.5 * float(value + off @ off), gradient
 
-    found = minimize(cost, np.log(start), jac=True, method="L-BFGS-B", options={"maxiter": 60})
+    bounds = [(centre - _REACH, centre + _REACH) for centre in typical]
+    found = minimize(cost, np.log(start), jac=True, method="L-BFGS-B", bounds=bounds, options=_LBFGS)
     return np.asarray(np.exp(found.x), np.float64)
 
 

@@ -11,7 +11,7 @@ from dataset.transforms import SE3
 
 
 def _glossy(world, strength, angle_deg, seed=0):
-    """A view of the board with a smooth blob of linearly polarized glare on it: the mosaic and T_cam_board."""
+    """A view of the board with a smooth blob of linearly polarized glare on it: mosaic and T_cam_board."""
     rng = np.random.default_rng(seed)
     centre = SE3(np.eye(3), -0.5 * np.array([*world.spec.size_m, 0.0]))
     T_cam_board = SE3.from_rotvec([0.25, -0.2, 0.1], [0.0, 0.0, 0.5]) @ centre

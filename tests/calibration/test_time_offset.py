@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from calibration.intrinsics import board_pose
+from calibration.streams import solve_streams
 from calibration.time_offset import estimate_time_offset
 from dataset.errors import CalibrationError
-from dataset.transforms import SE3
+from dataset.transforms import SE3, translation_error_mm
 
 START_NS = 7_000_000_000_000
 
@@ -31,9 +33,10 @@ def _swing(world, seed, offset_s, amplitude=1.0, frames=60, seconds=8.0):
     return host_mid_ns, START_NS + np.round(times * 1e9).astype(np.int64), trace, detections
 
 
-def _estimate(world, recording, T_tcp_cam=None):
+def _estimate(world, recording, T_tcp_cam=None, covariance=None):
     T_tcp_cam = world.T_tcp_cam if T_tcp_cam is None else T_tcp_cam
-    return estimate_time_offset(*recording, world.spec, world.intrinsics, T_tcp_cam, world.T_base_board)
+    board = world.T_base_board
+    return estimate_time_offset(*recording, world.spec, world.intrinsics, T_tcp_cam, board, covariance)
 
 
 @pytest.mark.parametrize("offset_s", [0.033, -0.02, 0.45, 0.0])
@@ -63,3 +66,37 @@ def test_a_delay_out_of_range_is_refused(world):
 def test_too_few_frames_are_refused(world):
     with pytest.raises(CalibrationError, match="5 frames show the board"):
         _estimate(world, _swing(world, 5, 0.03, frames=5))
+
+
+def test_the_speeds_correlate_at_the_offset(world):
+    result = _estimate(world, _swing(world, 6, 0.12))
+    assert result.correlation is not None
+    assert abs(result.correlation.best_s - 0.12) < 0.02
+    assert np.nanmax(result.correlation.correlation) > 0.95
+
+
+def test_refining_the_hand_eye_transform_with_the_offset_undoes_its_error(world):
+    """A known uncertainty of the transforms: what they are off no longer passes for delay."""
+    off = world.T_tcp_cam @ SE3.exp([6e-4, -5e-4, 3e-4, 1e-3, -5e-4, 6e-4])
+    covariance = np.diag(([5e-4] * 3 + [1e-3] * 3) * 2) ** 2
+    alone, joint, sigmas = [], [], []
+    for seed in range(3):
+        recording = _swing(world, 30 + seed, 0.025, frames=40)
+        alone.append(_estimate(world, recording, off).offset_s - 0.025)
+        result = _estimate(world, recording, off, covariance)
+        joint.append(result.offset_s - 0.025)
+        sigmas.append(result.sigma_s)
+    assert np.abs(joint).max() < 2e-4
+    assert np.abs(joint).mean() < 0.5 * np.abs(alone).mean()
+    assert np.all(np.abs(joint) < 4 * np.array(sigmas))
+
+
+def test_two_streams_of_poses_give_offset_and_transforms_without_any_calibration(world):
+    _, arm_ns, trace, _ = recording = _swing(world, 40, 0.07, frames=80)
+    seen = SE3.stack([board_pose(d, world.spec, world.intrinsics) for d in recording[3]])
+    camera_s, arm_s = (recording[0] - START_NS) * 1e-9, (arm_ns - START_NS) * 1e-9
+    result = solve_streams(arm_s, trace, camera_s, seen)
+    assert abs(result.offset_s - 0.07) < min(1e-3, 5 * result.offset_sigma_s)
+    assert translation_error_mm(result.T_mount_cam, world.T_tcp_cam) < 1.0
+    with pytest.raises(CalibrationError, match="do not turn alike"):
+        solve_streams(arm_s + 30.0, trace, camera_s, seen)

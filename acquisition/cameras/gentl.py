@@ -20,7 +20,8 @@ from dataset.errors import DeviceError, ToolkitError
 from dataset.frames import RawFrame
 from dataset.pixel_formats import pixel_format, unpack
 
-_POLL_S = 0.1
+_POLL_S = 0.001
+_AT_ONCE_S = 1e-6  # 0 would mean for ever
 _NAMES = ("serial_number", "id_", "user_defined_name", "model", "vendor")
 
 
@@ -166,6 +167,7 @@ class GenTLGrabber:
     def start(self) -> None:
         """Starts the acquisition and the thread. Raises DeviceError when the camera refuses."""
         self._library.on_incomplete(self._acquirer)
+        self._acquirer.timeout_period_on_update_event_data_call = 0
         try:
             self._acquirer.start()
         except self._library.error as error:
@@ -187,13 +189,15 @@ class GenTLGrabber:
     def _run(self) -> None:
         while not self._stopping.is_set():
             try:
-                buffer = self._acquirer.fetch(timeout=_POLL_S, is_raw=True)
+                buffer = self._acquirer.fetch(timeout=_AT_ONCE_S, is_raw=True)
                 arrived_ns = time.monotonic_ns()
                 try:
                     frame = self._decode(buffer, arrived_ns)
                 finally:
                     buffer.parent.queue_buffer(buffer)
             except self._library.timeout:
+                # genicam waits with Python's lock held: nobody else could work. So the waiting is ours.
+                time.sleep(_POLL_S)
                 continue
             except Incomplete:
                 self._frames.count_incomplete()

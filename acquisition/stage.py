@@ -9,13 +9,12 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from acquisition.kinematics import DH_A, DH_D, link_transforms
+from dataset.pictures import Picture, in_colour
 from dataset.transforms import SE3
 from dataset.view_sphere import ViewSphere
 
 if TYPE_CHECKING:
     import viser
-
-    from dataset.pictures import Picture
 
 Segment = tuple[tuple[float, float, float], tuple[float, float, float], float]
 
@@ -48,9 +47,11 @@ _CAPS: tuple[tuple[Segment, ...], ...] = (
 """A UR5e's tubes and joints in the frames of its links, base first: start, end and radius, metres. Lengths
 are the published Denavit-Hartenberg ones, thicknesses roughly those of the real arm."""
 
-_UNSEEN, _SEEN = np.array([120, 125, 135]), np.array([[68, 80, 160], [33, 145, 140], [180, 222, 44]])
+_UNSEEN, _SEEN = np.array([120, 125, 135]), np.array([[20, 60, 190], [0, 150, 110], [255, 210, 0]])
 _ENOUGH = 30
 """Looks from a cell of the view sphere with which it is drawn in full colour (our choice)."""
+_LEAST_WIDTH_PX = 400
+_SEEN_RAD = 1e-4  # a change of a joint that nobody sees
 _TILE = 0.86  # of a cell, so that neighbours can be told apart
 
 
@@ -62,6 +63,7 @@ class ArmModel:
     """
 
     def __init__(self, server: viser.ViserServer, parent: str = "") -> None:
+        self._q = np.full(6, np.inf)
         self._links = [
             server.scene.add_frame(f"{parent}/arm/link{link}", show_axes=False) for link in range(7)
         ]
@@ -73,15 +75,19 @@ class ArmModel:
                         f"{parent}/arm/link{link}/{name}", mesh.vertices, mesh.faces, color=colour
                     )
 
-    def move(self, q: ArrayLike) -> None:
+    def move(self, q: NDArray[np.float64]) -> None:
         """To joint angles (6,), radians."""
+        if np.abs(q - self._q).max() < _SEEN_RAD:
+            return
+        self._q = q
         for frame, matrix in zip(self._links, link_transforms(q), strict=True):
             place(frame, SE3.from_matrix(matrix))
 
     def show(self, visible: bool) -> None:
         """Or hides it."""
         for frame in self._links:
-            frame.visible = visible
+            if frame.visible != visible:
+                frame.visible = visible
 
 
 class ViewTiles:
@@ -102,6 +108,7 @@ class ViewTiles:
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
         rotation = np.stack([across, np.cross(outwards, across), outwards], axis=-1)
         sides = _TILE * radius * views.sizes
+        self._counts = np.zeros(len(views), np.int64)
         self._tiles = server.scene.add_batched_meshes_simple(
             "/views",
             np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]]),
@@ -114,10 +121,14 @@ class ViewTiles:
             side="double",
             cast_shadow=False,
             receive_shadow=False,
+            lod="off",
         )
 
     def paint(self, counts: NDArray[np.int64]) -> None:
         """By looks (C,) from each cell."""
+        if np.array_equal(counts, self._counts):
+            return
+        self._counts = counts.copy()
         self._tiles.batched_colors = cell_colours(counts)
         self._tiles.batched_opacities = np.where(counts > 0, 0.75, 0.15).astype(np.float32)
 
@@ -139,7 +150,7 @@ def add_camera(
         aspect=width / height,
         scale=scale,
         color=(240, 170, 40),
-        thickness=0.003,
+        thickness=0.03 * scale,
         jpeg_quality=70,
         cast_shadow=False,
     )
@@ -160,10 +171,18 @@ def add_table(server: viser.ViserServer) -> None:
     )
 
 
+def light(server: viser.ViserServer) -> None:
+    """Plain light: shadows would keep a computer without a graphics card busy."""
+    server.scene.configure_default_lights(cast_shadow=False)
+
+
 def place(node: viser.SceneNodeHandle, pose: SE3) -> None:
     """Puts a node of the scene at a pose in its parent's frame."""
-    node.wxyz = quaternions(pose.rotation)
-    node.position = pose.translation
+    if not np.array_equal(node.position, pose.translation):
+        node.position = pose.translation
+    wxyz = quaternions(pose.rotation)
+    if not np.array_equal(node.wxyz, wxyz):
+        node.wxyz = wxyz
 
 
 def quaternions(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -172,8 +191,10 @@ def quaternions(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rgb(picture: Picture) -> Picture:
-    """(h, w, 3) RGB, which pages show, of a grey or BGR picture."""
-    return np.dstack([picture] * 3) if picture.ndim == 2 else np.ascontiguousarray(picture[..., ::-1])
+    """(h', w', 3) RGB, which pages show, of a grey or BGR picture; a tiny one enlarged to be seen."""
+    coloured = in_colour(picture)[..., ::-1]
+    factor = -(-_LEAST_WIDTH_PX // coloured.shape[1])
+    return np.ascontiguousarray(coloured.repeat(factor, axis=0).repeat(factor, axis=1))
 
 
 def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:

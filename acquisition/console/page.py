@@ -118,6 +118,7 @@ class ConsolePage:
                 },
                 axes=(_axis(), _axis()),
                 legend={"show": False},
+                padding=(10, 24, 0, 0),
                 height=190,
             )
         panel.dock_left()
@@ -151,6 +152,7 @@ class ConsolePage:
 
     def _lay_out_scene(self, rig: Rig) -> None:
         server = self._server
+        stage.light(server)
         stage.add_table(server)
         self._arm = stage.ArmModel(server)
         self._arm.show(False)
@@ -197,7 +199,8 @@ class ConsolePage:
     def _update_arm(self) -> None:
         sample, pose = self._station.arm.latest, self._station.T_base_cam()
         self._arm.show(sample is not None)
-        self._camera.visible = pose is not None
+        if self._camera.visible != (pose is not None):
+            self._camera.visible = pose is not None
         if sample is not None and pose is not None:
             self._arm.move(sample.q)
             stage.place(self._camera, pose)

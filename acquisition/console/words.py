@@ -58,7 +58,8 @@ def recording(current: Recording | None, covered: int, cells: int) -> str:
     """The counters of the newest recording."""
     if current is None:
         return _box(f'<div style="color:{_IDLE}">Nothing recorded yet.</div>')
-    colour = _STATE_COLOURS[current.state]
+    said, state_colour = bool(current.message), _STATE_COLOURS[current.state]
+    colour = _WARN if current.state == "complete" else state_colour  # of what is doubtful about it
     minutes, seconds = divmod(int(current.seconds), 60)
     counters = (
         _counter("stored", f"{current.stored}")
@@ -67,14 +68,10 @@ def recording(current: Recording | None, covered: int, cells: int) -> str:
         + _counter("views", f"{covered}/{cells}")
     )
     return _box(
-        f'<div style="font-weight:600"><span style="color:{colour}">&#9679; {current.state}</span> '
+        f'<div style="font-weight:600"><span style="color:{state_colour}">&#9679; {current.state}</span> '
         f"{escape(current.path.name)}</div>"
         f'<div style="display:flex;justify-content:space-between;margin-top:.5em">{counters}</div>'
-        + (
-            f'<div style="color:{_BAD};margin-top:.5em">{escape(current.message)}</div>'
-            if current.message
-            else ""
-        )
+        + (f'<div style="color:{colour};margin-top:.5em">{escape(current.message)}</div>' if said else "")
     )
 
 
@@ -126,7 +123,7 @@ def _line(name: str, problem: str | None, text: str, good: bool) -> str:
     colour = _BAD if problem is not None else _GOOD if good else _WARN
     return (
         f'<div style="display:flex;gap:.5em;margin-bottom:.2em"><span style="color:{colour}">&#9679;</span>'
-        f'<span style="min-width:6.6em;font-weight:600">{name}</span>'
+        f'<span style="min-width:7.6em;font-weight:600;white-space:nowrap">{name}</span>'
         f"<span>{escape(text if problem is None else problem)}</span></div>"
     )
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 _PERIOD_S = 0.03
 _PICTURE_PX = 200
-_LIVE_WIDTH_PX, _CONTROL_WIDTH_PX = 470, 370
-_CHART_HEIGHT_PX = 150
-_FRUSTA = 60
+_LIVE_WIDTH_PX, _CONTROL_WIDTH_PX = 440, 380
+_CHART_HEIGHT_PX = 115
+_FRUSTA = 40
 """Of the cameras on the way, how many are drawn."""
 _TILES_RADIUS = 0.45
 """Of the view sphere, in median distances of the camera."""
@@ -69,6 +69,7 @@ class ViewerPage:
         server.gui.configure_theme(dark_mode=True, show_share_button=False, brand_color=(74, 144, 217))
         self._lay_out_pictures()
         self._lay_out_controls()
+        stage.light(server)
         if self._world is None:
             stage.add_table(server)
         else:
@@ -78,6 +79,10 @@ class ViewerPage:
         """Keeps the page up to date until `over` is set."""
         while not over.wait(_PERIOD_S):
             self.update()
+
+    def show(self, index: int) -> None:
+        """Moves the slider to a frame."""
+        self._slider.value = index  # type: ignore[misc]
 
     def update(self) -> None:
         """Shows what slider and menus ask for."""
@@ -131,6 +136,7 @@ class ViewerPage:
             scales={"x": {"time": False}},
             axes=(axis, axis),
             legend={"show": False},
+            padding=(10, 24, 0, 0),
             height=_CHART_HEIGHT_PX,
         )
 
@@ -201,7 +207,7 @@ class ViewerPage:
         if index + 1 == len(times):
             self._playing.value = False  # type: ignore[misc]
         if index != self._slider.value:
-            self._slider.value = index  # type: ignore[misc]
+            self.show(index)
 
     def _describe(self, index: int) -> str:
         """A line on the frame, and one on each object in it."""

@@ -263,7 +263,9 @@ def test_a_folder_nobody_may_write_to(fails: Fails, tmp_path: Path) -> None:
         (["capture", "intrinsics", "--out", "s.h5", "--views", "0"], "--views 0"),
         (["capture", "sequence", "--out", "s.h5", "--seconds", "-1"], "--seconds -1"),
         (["capture", "board-motion", "--out", "s.h5", "--seconds", "nan"], "--seconds nan"),
-        (["capture", "tool-tip", "--out", "s.h5", "--points", "0"], "--points 0"),
+        (["capture", "touches", "--out", "s.h5", "--points", "0"], "--points 0"),
+        (["capture", "tool-tip", "--out", "s.h5", "--poses", "5"], "--poses 5"),
+        (["capture", "polarizer", "--out", "s.h5", "--angles", "2"], "--angles 2"),
     ],
 )
 def test_numbers_that_make_no_sense(fails: Fails, rig: Path, words: list[str], option: str) -> None:

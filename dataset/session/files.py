@@ -132,6 +132,12 @@ def hold(path: Path) -> int:
     return descriptor
 
 
+def room(path: Path) -> int:
+    """Bytes that can still be written to the disk that a file is on."""
+    disk = os.statvfs(path)
+    return disk.f_bavail * disk.f_frsize
+
+
 def in_use(path: Path) -> bool:
     """Whether any program has the session open: recording, changing or reading it."""
     descriptor = os.open(path, os.O_RDONLY)

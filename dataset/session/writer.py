@@ -36,9 +36,13 @@ from dataset.schema import (
 from dataset.session.clock_store import fit_stored, store
 from dataset.session.continuing import BEGINNING, GROWING, begin_segment, host_boot_id, open_to_continue
 from dataset.session.edit import store_intrinsics, store_object
-from dataset.session.files import LIBVER, create, dtype_of, hold, make_dataset
+from dataset.session.files import LIBVER, create, dtype_of, hold, make_dataset, room
 from dataset.session.records import Clocks, ObjectRecord
 from dataset.session.seals import leave_open, seal
+
+_KEPT_FREE_BYTES = 16 << 20
+"""A frame that would leave less is refused: the rest of the arm's trace needs room, and HDF5 can neither close
+a file on a full disk nor, in the same process, open it again (our choice)."""
 
 
 class SessionWriter:
@@ -137,7 +141,7 @@ class SessionWriter:
             chunk: `compress(frame.pixels)` where another thread has done it already.
 
         Raises:
-            SessionError: the frame does not fit the camera, its id does not grow, or the disk refuses it.
+            SessionError: the frame does not fit the camera, its id does not grow, or the disk is full.
         """
         expected = (self.camera.height, self.camera.width)
         if frame.pixels.shape != expected or frame.pixels.dtype != self._dtype:
@@ -153,6 +157,8 @@ class SessionWriter:
                     f"{self.path}: frame id {frame.frame_id} follows {self._last_id}; unwrap the camera's "
                     "counter and hand frames over in order"
                 )
+            if room(self.path) < len(chunk.data) + _KEPT_FREE_BYTES:
+                raise OSError(f"{_KEPT_FREE_BYTES >> 20} MB are left on the disk")
             index = self._frames
             if self._clock_epoch is not None and frame.clock_epoch != self._clock_epoch:
                 begin_segment(file, index, self._samples)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import shlex
 import signal
 import subprocess
 import sys
@@ -150,6 +151,34 @@ def test_a_disk_that_fills_up_is_the_error_and_costs_no_stored_frame(
     result = repair(path)
     assert result.frames >= max(map(int, counts), default=1)
     assert_whole(path, 1)
+
+
+FULL_DISK = """
+mount -t tmpfs -o size=17m tmpfs {mount} || exit 77
+cd {mount} && echo "full.h5 new 0" | {python} -c {code} && cp full.h5 {out}
+"""
+
+
+def test_a_full_disk_leaves_a_file_that_was_closed_in_good_order(tmp_path: Path) -> None:
+    """A real one: a small file system in memory, in a mount namespace of its own."""
+    mount, out = tmp_path / "disk", tmp_path / "full.h5"
+    mount.mkdir()
+    script = FULL_DISK.format(mount=mount, python=sys.executable, code=shlex.quote(RECORDER), out=out)
+    command = ["unshare", "--mount", "sh", "-c", script]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    if ended.returncode == 77 or "unshare failed" in ended.stderr:
+        pytest.skip("mounting a file system is not permitted here")
+    assert ended.returncode == 0, ended.stderr
+    error = next(line for line in ended.stdout.splitlines() if line.startswith("error"))
+    assert "16 MB are left on the disk" in error
+    with Session.open(out) as session:
+        assert not session.complete
+        assert session.clocks.camera is not None
+        stored = len(session)
+    assert stored > 50
+    result = repair(out)
+    assert (result.frames, result.damaged_ids, result.lost) == (stored, (), ())
+    assert_whole(out, 1)
 
 
 def test_what_cannot_go_on_says_why(tmp_path: Path, recorders: Recorders) -> None:

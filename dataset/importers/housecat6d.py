@@ -167,6 +167,6 @@ def _object(
     vertices, faces = read_mesh(folder / instance.kind / f"{instance.name}.obj", UNITS[unit])
     check_mesh(instance.name, vertices)
     material, index = _MATERIALS.get(instance.kind, ("plastic", 1.5))
-    record = ObjectRecord(instance.name, vertices, faces, material, index, 0.0, "", widest(vertices))
+    record = ObjectRecord(instance.name, vertices, faces, material, index, 0.0, "{}", widest(vertices))
     # the labels do not say how much is hidden: 1 where anything is seen (our choice)
     return annotated(record, matrices, masks, np.asarray(masks.any(axis=(1, 2)), np.float64))

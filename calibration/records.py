@@ -107,6 +107,42 @@ class HandEyeRecord:
 
 
 @dataclass(frozen=True, eq=False)
+class FixedCameraRecord:
+    """A camera beside the arm: where it stands, and the board on the tool; the rest as `HandEyeRecord`."""
+
+    T_base_cam: SE3
+    T_tcp_board: SE3
+    covariance: Floats
+    rms_px: float
+    held_out_mm: float
+    held_out_deg: float
+    arm_sigma_m: float
+    arm_sigma_rad: float
+    views: int
+    sources: tuple[Source, ...]
+
+    @staticmethod
+    def of(result: HandEyeResult, sources: tuple[Source, ...]) -> FixedCameraRecord:
+        """The part of a result that is kept.
+
+        Raises:
+            CalibrationError: a result with the camera on the tool.
+        """
+        return FixedCameraRecord(
+            result.T_mount_cam,
+            result.T_tcp_board,
+            result.covariance,
+            result.rigid_rms_px,
+            result.held_out_mm,
+            result.held_out_deg,
+            result.arm_sigma_m,
+            result.arm_sigma_rad,
+            int(result.used.sum()),
+            sources,
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class TimeOffsetRecord:
     """The arm's pose at an exposure is its trace at (mid exposure on the host clock + offset_s)."""
 
@@ -182,11 +218,11 @@ class PolarizerRecord:
         """The part of a result that is kept in calibration.json; the rest is in the file."""
         response = result.response
         alive = response.gain > 0
-        ratio = np.percentile(response.extinction_ratio[alive], [5, 50, 95])
+        ratio = np.minimum(response.extinction_ratio[alive], EXTINCTION_MEASURABLE)
         return PolarizerRecord(
             file.name,
             digest,
-            np.minimum(ratio, EXTINCTION_MEASURABLE),
+            np.percentile(ratio, [5, 50, 95]),
             float(response.orientation_error[alive].std()),
             float(response.gain[alive].std()),
             result.cell_deg,

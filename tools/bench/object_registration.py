@@ -5,8 +5,8 @@
 The points are those that the simulated lab's operator would touch, 0.1 mm noise along the normal, on each of
 the lab's objects. Open3D gets the same number of random starts, 20 000 points with normals sampled from the
 mesh, and two rounds of ICP (a tenth of the object's size, then 3 mm), and keeps the fit with the smallest
-distances. Rotation errors are up to the object's symmetry. Prints medians and the worst, and how many seconds a
-registration takes.
+distances. Rotation errors are up to the object's symmetry. Prints medians and the worst, and how many seconds
+a registration takes.
 """
 
 from __future__ import annotations

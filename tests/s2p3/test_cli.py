@@ -19,6 +19,7 @@ import trimesh
 from acquisition.rig import EXAMPLE, Rig
 from calibration import Calibration
 from dataset.session import Session
+from dataset.session.seals import reopen, seal
 from s2p3 import objects
 from s2p3.cli import VERBS, Group, main
 from s2p3.lab.rig import lab_rig
@@ -341,6 +342,9 @@ def test_dataset_validate_lists_every_problem(cup_copy: Path, capfd: pytest.Capt
     with h5py.File(cup_copy, "r+") as file:
         file["camera/exposure_us"][2] = -1.0
         file["poses/sigma_t"][:] = -1.0
+        for changed in ("camera/exposure_us", "poses/sigma_t"):
+            reopen(file[changed])
+        seal(file)
     assert main(["dataset", "validate", str(cup_copy)]) == 2
     lines = capfd.readouterr().err.splitlines()
     assert [line.split(":")[0] for line in lines] == ["camera/exposure_us", "poses/sigma_t", "s2p3"]

@@ -127,7 +127,9 @@ def study(seed: int) -> dict[str, Any]:
     )
 
     film = filmed(reported[STILLS:], arm, truth, photograph, rng)
-    offset = estimate_time_offset(*film, spec, camera.intrinsics, hand_eye.T_tcp_cam, hand_eye.T_base_board)
+    offset = estimate_time_offset(
+        *film, spec, camera.intrinsics, hand_eye.T_tcp_cam, hand_eye.T_base_board, hand_eye.covariance
+    )
 
     hole = SE3(np.stack([r for r, _ in zip(tilts(rng), range(PIVOTS), strict=False)]), np.zeros((PIVOTS, 3)))
     slips = rng.normal(0, truth.pivot_noise_m, (PIVOTS, 3)) + PIVOT_POINT

@@ -41,8 +41,8 @@ from dataset.session.records import Clocks, ObjectRecord
 from dataset.session.seals import leave_open, seal
 
 _KEPT_FREE_BYTES = 16 << 20
-"""A frame that would leave less is refused: the rest of the arm's trace needs room, and HDF5 can neither close
-a file on a full disk nor, in the same process, open it again (our choice)."""
+"""A frame that would leave less is refused: the rest of the arm's trace needs room, and HDF5 can neither
+close a file on a full disk nor, in the same process, open it again (our choice)."""
 
 
 class SessionWriter:

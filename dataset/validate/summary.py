@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataset.frames import CameraInfo
+from dataset.session.accounting import account
 from dataset.session.reader import Session
 
 
@@ -21,10 +22,13 @@ class SessionInfo:
         size_bytes: of the file.
         camera: its description.
         frames, drops: frames stored, and known to be missing.
+        paused: frames taken while the recording was paused.
+        segments: uninterrupted recordings that the file is made of.
         duration_s: from the first to the last frame, host clock, seconds.
         robot_samples: of the arm's trace.
         clocks: whose clock was fitted to the host's.
         calibrated, posed: whether a calibration and camera poses are stored.
+        polarizers: whether Stokes images are computed with the calibrated response of the pixels.
         objects: names; annotated: those with poses.
         splits: number of frames by name.
     """
@@ -42,10 +46,13 @@ class SessionInfo:
     camera: CameraInfo
     frames: int
     drops: int
+    paused: int
+    segments: int
     duration_s: float
     robot_samples: int
     clocks: tuple[str, ...]
     calibrated: bool
+    polarizers: bool
     posed: bool
     objects: tuple[str, ...]
     annotated: tuple[str, ...]
@@ -78,10 +85,13 @@ def info(path: str | Path) -> SessionInfo:
             camera=session.camera,
             frames=frames,
             drops=contents.length("camera/drops"),
+            paused=account(session).paused,
+            segments=max(1, len(session.segments)),
             duration_s=(ends[-1] - ends[0]) * 1e-9,
             robot_samples=contents.length("robot/host_time_ns"),
             clocks=tuple(name for name in ("camera", "robot") if getattr(fits, name) is not None),
             calibrated=contents.has("calibration/K"),
+            polarizers=contents.has("calibration/polarizer_response"),
             posed=contents.has("poses/T_base_cam"),
             objects=session.objects,
             annotated=contents.names("poses/objects"),

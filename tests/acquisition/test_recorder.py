@@ -27,7 +27,7 @@ from acquisition.robots.ur_receiver import UrReceiver
 from acquisition.simulation.camera import SimulatedCamera
 from acquisition.simulation.patterns import MovingPattern
 from acquisition.simulation.robot import SimulatedRobot
-from calibration.touches import touched_points
+from calibration.touches import KnownTip, touched_points
 from dataset.errors import DeviceError, SessionError, ToolkitError
 from dataset.frames import RawFrame, RobotTrace
 from dataset.rests import find_rests
@@ -372,7 +372,7 @@ def test_touches_are_taken_while_a_hand_guides_the_arm(tmp_path: Path, simulated
 
         guiding = threading.Thread(target=guide)
         told: list[Progress] = []
-        with SessionWriter(tmp_path / "t.h5", "tool_tip", NO_CAMERA) as writer:
+        with SessionWriter(tmp_path / "t.h5", "touches", NO_CAMERA) as writer:
             guiding.start()
             touches = record_touches(receiver, writer, 3, on_progress=told.append)
         guiding.join()
@@ -382,9 +382,9 @@ def test_touches_are_taken_while_a_hand_guides_the_arm(tmp_path: Path, simulated
     assert translation_error_mm(found, expected).max() < 0.1
     assert validate(tmp_path / "t.h5") == []
     with Session.open(tmp_path / "t.h5") as session:
-        assert (session.kind, session.complete, len(session)) == ("tool_tip", True, 0)
+        assert (session.kind, session.complete, len(session)) == ("touches", True, 0)
         assert session.robot is not None
         again = find_rests(session.robot)
         assert [(r.begin, r.end) for r in again] == [(t.begin, t.end) for t in touches]
-        tips = touched_points(session, [0.0, 0.0, 0.05])
-    np.testing.assert_allclose(tips, expected.apply([0.0, 0.0, 0.05]), atol=2e-4)
+        tips = touched_points(session, KnownTip.exactly([0.0, 0.0, 0.05]))
+    np.testing.assert_allclose(tips.points, expected.apply([0.0, 0.0, 0.05]), atol=2e-4)

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import html, plots
+from calibration import html, plots, view_plots
 from calibration.board import BoardSpec
 from calibration.detection import intensity_image
 from calibration.hand_eye import HandEyeResult
 from calibration.intrinsics import IntrinsicsResult
+from calibration.resampling import Intervals
 from calibration.time_offset import TimeOffsetResult
 from dataset.frames import Mosaic
 from dataset.polarimetry import Raw
@@ -33,6 +34,7 @@ def calibration_report(
     hand_eye: HandEyeResult | None = None,
     time_offset: TimeOffsetResult | None = None,
     pictures: Sequence[ViewPicture] = (),
+    intervals: Intervals | None = None,
     title: str = "Calibration report",
     subtitle: str = "",
 ) -> str:
@@ -42,23 +44,17 @@ def calibration_report(
         spec: the board, where one was used.
         intrinsics, hand_eye, time_offset: results.
         pictures: of views of ``hand_eye`` where given, else of ``intrinsics``, to draw the corners on.
+        intervals: of ``hand_eye``, by the bootstrap.
         title, subtitle: of the page.
     """
     sections: list[str] = []
     if intrinsics is not None:
         sections.append(_intrinsics(intrinsics, pictures if hand_eye is None else ()))
     if hand_eye is not None:
-        sections.append(_hand_eye(hand_eye, pictures))
+        sections.append(_hand_eye(hand_eye, pictures, intervals))
     if time_offset is not None:
         sections.append(_time_offset(time_offset))
-    return html.page(title, subtitle, sections, "" if spec is None else _describe(spec))
-
-
-def _describe(spec: BoardSpec) -> str:
-    return (
-        f"Board: {spec.squares_x} x {spec.squares_y} squares of {1e3 * spec.square_m:g} mm, markers of"
-        f" {1e3 * spec.marker_m:g} mm, {spec.dictionary}."
-    )
+    return html.page(title, subtitle, sections, "" if spec is None else f"Board: {spec}.")
 
 
 def _intrinsics(result: IntrinsicsResult, pictures: Sequence[ViewPicture]) -> str:
@@ -92,8 +88,20 @@ def _intrinsics(result: IntrinsicsResult, pictures: Sequence[ViewPicture]) -> st
                 plots.residual_scatter(result.residual_px, outlier), "Predicted minus seen corners.", 5
             ),
             html.figure(
-                plots.bars(result.view_rms_px, ~result.used, labels, "px", 1070),
+                view_plots.coverage_map(result.pixels[~outlier], size),
+                "Corners seen in each part of the image; where there are none the lens is extrapolated.",
+                5,
+            ),
+            html.figure(
+                plots.bars(result.view_rms_px, ~result.used, labels, "px", 620),
                 "Residual of every view (rms); views in the second colour were left out.",
+                7,
+            ),
+            html.figure(
+                view_plots.view_residuals(
+                    result.view, result.pixels, result.residual_px, result.view_rms_px, result.used, size
+                ),
+                "Residuals of every view, magnified alike, with their rms.",
                 12,
             ),
             *_overlays(pictures, result.view, result.pixels, result.residual_px),
@@ -116,19 +124,30 @@ def _intrinsics(result: IntrinsicsResult, pictures: Sequence[ViewPicture]) -> st
     )
 
 
-def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture]) -> str:
+def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture], intervals: Intervals | None) -> str:
     outlier = ~result.used[result.view]
     width, height = result.board_size_m
     corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]])
-    sketch = plots.pose_sketch(result.T_base_cam, result.T_base_board.apply(corners), result.used, "base")
+    board = result.T_base_board_seen[0].apply(corners)
+    sketch = plots.pose_sketch(result.T_base_cam, board, result.used, "base")
+    on_tool = result.mount == "eye_in_hand"
     labels = [str(i) for i in range(len(result.used))]
-    pose = result.T_tcp_cam.as_pose6()
+    pose = result.T_mount_cam.as_pose6()
     sigma = np.sqrt(np.diagonal(result.covariance)[:6])
+    half = [""] * 6
+    if intervals is not None:
+        half = [f"± {v:.3f} mm" for v in intervals.half_mm] + [f"± {v:.4f} deg" for v in intervals.half_deg]
     rows = [
-        [f"t {axis}", f"{1e3 * pose[i]:.3f} mm", f"{1e3 * sigma[i]:.3f} mm"] for i, axis in enumerate("xyz")
+        [f"t {axis}", f"{1e3 * pose[i]:.3f} mm", f"{1e3 * sigma[i]:.3f} mm", half[i]]
+        for i, axis in enumerate("xyz")
     ]
     rows += [
-        [f"r {axis}", f"{np.degrees(pose[3 + i]):.4f} deg", f"{np.degrees(sigma[3 + i]):.4f} deg"]
+        [
+            f"r {axis}",
+            f"{np.degrees(pose[3 + i]):.4f} deg",
+            f"{np.degrees(sigma[3 + i]):.4f} deg",
+            half[3 + i],
+        ]
         for i, axis in enumerate("xyz")
     ]
     methods = sorted(result.candidates_px.items(), key=lambda item: item[1])
@@ -151,7 +170,11 @@ def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture]) -> str:
             *_overlays(pictures, result.view, result.pixels, result.residual_px),
         ),
         html.tiles(
-            html.Tile("Camera on the tool", f"± {1e3 * result.sigma_m:.3f} mm", "one sigma, all axes"),
+            html.Tile(
+                "Camera on the tool" if on_tool else "Camera in the base",
+                f"± {1e3 * result.sigma_m:.3f} mm",
+                "one sigma, all axes",
+            ),
             html.Tile("Its rotation", f"± {np.degrees(result.sigma_rad):.4f}°", "one sigma, all axes"),
             html.Tile(
                 "Held-out error",
@@ -166,7 +189,8 @@ def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture]) -> str:
             html.Tile(
                 "Rotation spread",
                 f"{spread[0]:.0f}° / {spread[1]:.0f}° / {spread[2]:.0f}°",
-                "rms about the principal axes",
+                "rms about the principal axes; smallest singular value"
+                f" {result.spread.smallest_singular:.2f}",
                 "good" if spread[1] > 8 else "warn",
             ),
             html.Tile(
@@ -180,7 +204,10 @@ def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture]) -> str:
                 _rejected(np.flatnonzero(~result.used)),
             ),
         ),
-        html.table(["T_tcp_cam", "Value", "Standard deviation"], rows),
+        html.table(
+            ["T_tcp_cam" if on_tool else "T_base_cam", "Value", "Standard deviation", "95 % (bootstrap)"],
+            rows,
+        ),
         html.table(
             ["Closed form", "Median corner error"], [[name, f"{error:.3f} px"] for name, error in methods]
         ),
@@ -191,6 +218,22 @@ def _time_offset(result: TimeOffsetResult) -> str:
     order = np.argsort(result.speed_px_s)
     labels = [f"{result.speed_px_s[i]:.0f}" for i in order]
     apart = np.abs(1e3 * (result.frame_offset_s[order] - result.offset_s))
+    figures: list[str] = []
+    if result.correlation is not None:
+        told = np.isfinite(result.correlation.correlation)
+        figures.append(
+            html.figure(
+                plots.curve(
+                    result.correlation.offset_s[told],
+                    result.correlation.correlation[told],
+                    result.offset_s,
+                    "offset tried, s",
+                    "correlation",
+                ),
+                "Correlation of how fast camera and arm turn, before any calibration is used.",
+                12,
+            )
+        )
     return html.section(
         "Time offset",
         "The board stands still, so the delay between camera and arm is the one that makes it stand still"
@@ -209,6 +252,7 @@ def _time_offset(result: TimeOffsetResult) -> str:
                 "How far each frame alone is from the estimate; frames by corner speed, px/s.",
                 6,
             ),
+            *figures,
         ),
         html.tiles(
             html.Tile(

@@ -9,13 +9,14 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board import BoardSpec
 from calibration.records import (
+    FixedCameraRecord,
     HandEyeRecord,
     IntrinsicsRecord,
     ObjectPoseRecord,
@@ -51,6 +52,7 @@ class Calibration:
     time_offset: TimeOffsetRecord | None = None
     tool_tip: ToolTipRecord | None = None
     polarizer: PolarizerRecord | None = None
+    fixed_camera: FixedCameraRecord | None = None
     objects: Mapping[str, ObjectPoseRecord] = field(default_factory=dict)
 
     def merged(self, newer: Calibration) -> Calibration:
@@ -206,6 +208,10 @@ def _decode_value(hint: Any, value: Any, at: str) -> Any:
         return float("nan") if value is None else float(value)
     if hint in (int, str):
         return hint(value)
+    if get_origin(hint) is Literal:
+        if value not in get_args(hint):
+            raise ValueError(value)
+        return value
     if hint is SE3:
         return SE3.from_matrix(np.asarray(value, np.float64))
     if hint == Floats:

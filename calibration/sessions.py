@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board import BoardSpec
-from calibration.closed_forms import mean_pose
+from calibration.closed_forms import Mount, mean_pose
 from calibration.detection import Detection, detect_in_mosaic, explain_missing_board, intensity_image
 from calibration.hand_eye import HandEyeResult, calibrate_hand_eye
 from calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
@@ -75,9 +75,10 @@ def hand_eye_from_session(
     spec: BoardSpec,
     intrinsics: IntrinsicsRecord,
     detections: Detections | None = None,
+    mount: Mount = "eye_in_hand",
 ) -> HandEyeResult:
-    """T_tcp_cam and T_base_board from stills of a fixed board; views in which the arm was not at rest are
-    left out.
+    """Where camera and board are, from stills of a fixed board, or by a fixed camera of a board on the tool;
+    views in which the arm was not at rest are left out.
 
     Raises:
         CalibrationError: as `detect_session` and `calibrate_hand_eye`, or no robot trace.
@@ -85,7 +86,7 @@ def hand_eye_from_session(
     detections = detect_session(session, spec) if detections is None else detections
     views, poses = views_at_rest(session, detections)
     return calibrate_hand_eye(
-        poses, [d for _, d in views], spec, intrinsics.intrinsics, intrinsics.covariance
+        poses, [d for _, d in views], spec, intrinsics.intrinsics, intrinsics.covariance, mount
     )
 
 

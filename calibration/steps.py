@@ -6,19 +6,23 @@ The report of a step lies beside the calibration: calibration.json gets calibrat
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from calibration.board import BoardSpec
+from calibration.closed_forms import Mount
+from calibration.next_pose import NextPose, next_pose
 from calibration.records import (
+    FixedCameraRecord,
     HandEyeRecord,
     IntrinsicsRecord,
     Source,
     TimeOffsetRecord,
 )
 from calibration.report import ViewPicture, calibration_report
+from calibration.resampling import Intervals, bootstrap
 from calibration.result import Calibration
 from calibration.sessions import (
     Detections,
@@ -29,6 +33,7 @@ from calibration.sessions import (
     time_offset_from_session,
     views_at_rest,
 )
+from calibration.view_selection import select_views
 from dataset.session import Session
 
 _PICTURES = 3
@@ -46,6 +51,7 @@ def add_intrinsics(
     """
     with Session.open(session) as opened:
         found = detect_session(opened, spec, on_progress)
+        found = [found[i] for i in select_views([d for _, d in found], spec)]
         result = intrinsics_from_session(opened, spec, found)
         pictures = _pictures(opened, found)
     record = IntrinsicsRecord.of(result, (Source.of(session),))
@@ -56,10 +62,24 @@ def add_intrinsics(
     return record
 
 
+@dataclass(frozen=True, eq=False)
+class HandEyeStep:
+    """What was added, its 95 % bootstrap intervals, and the view to take next for a better one."""
+
+    record: HandEyeRecord | FixedCameraRecord
+    intervals: Intervals
+    advice: NextPose
+
+
 def add_hand_eye(
-    session: Path, spec: BoardSpec, calibration: Path, on_progress: Progress | None = None
-) -> HandEyeRecord:
-    """Estimates T_tcp_cam and T_base_board from stills of the board.
+    session: Path,
+    spec: BoardSpec,
+    calibration: Path,
+    on_progress: Progress | None = None,
+    mount: Mount = "eye_in_hand",
+) -> HandEyeStep:
+    """Estimates T_tcp_cam and T_base_board from stills of the board; of a fixed camera (eye to hand),
+    T_base_cam and T_tcp_board.
 
     Raises:
         CalibrationError: no intrinsics yet; as `hand_eye_from_session`.
@@ -71,13 +91,22 @@ def add_hand_eye(
     with Session.open(session) as opened:
         found = detect_session(opened, spec, on_progress)
         views, _ = views_at_rest(opened, found)  # the result counts these, not all that show the board
-        result = hand_eye_from_session(opened, spec, known.intrinsics, views)
+        result = hand_eye_from_session(opened, spec, known.intrinsics, views, mount)
         pictures = _pictures(opened, views)
-    record = HandEyeRecord.of(result, (Source.of(session),))
-    known.merged(Calibration(board=spec, hand_eye=record)).save(calibration)
-    html = calibration_report(spec, hand_eye=result, pictures=pictures, subtitle=str(session))
+    sources = (Source.of(session),)
+    record: HandEyeRecord | FixedCameraRecord
+    if mount == "eye_in_hand":
+        record = HandEyeRecord.of(result, sources)
+        known.merged(Calibration(board=spec, hand_eye=record)).save(calibration)
+    else:
+        record = FixedCameraRecord.of(result, sources)
+        known.merged(Calibration(board=spec, fixed_camera=record)).save(calibration)
+    step = HandEyeStep(record, bootstrap(result), next_pose(result, spec))
+    html = calibration_report(
+        spec, hand_eye=result, pictures=pictures, subtitle=str(session), intervals=step.intervals
+    )
     report_path(calibration, "hand-eye").write_text(html, encoding="utf-8")
-    return record
+    return step
 
 
 def add_time_offset(

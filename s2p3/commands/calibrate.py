@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -15,6 +15,7 @@ from s2p3.commands.output import counting, say
 
 if TYPE_CHECKING:
     from calibration import BoardSpec
+    from calibration.closed_forms import Mount
 
 _FEWEST_PX_PER_SQUARE = 20
 """Two pixels a marker's cell, or nearly."""
@@ -91,6 +92,7 @@ def hand_eye(
     *,
     rig: Path,
     calibration: Path = Path("calibration.json"),
+    mount: Literal["eye-in-hand", "eye-to-hand"] = "eye-in-hand",
     apply: tuple[Path, ...] = (),
 ) -> None:
     """Estimate where the camera sits on the arm's tool, from stills of the board.
@@ -99,13 +101,21 @@ def hand_eye(
         session: recorded with s2p3 capture hand-eye.
         rig: rig.toml with the [board] table.
         calibration: calibration.json that has the intrinsics; the result is added.
+        mount: eye-to-hand: the camera stands beside the arm and the board is on the tool.
         apply: sessions to write the calibration into.
     """
     from calibration.steps import add_hand_eye
 
+    kind: Mount = "eye_in_hand" if mount == "eye-in-hand" else "eye_to_hand"
     with counting("detect the board") as report:
-        done = add_hand_eye(session, board_of(rig), calibration, report)
-    say(f"hand-eye from {done.views} views: held out {done.held_out_mm:.3f} mm, {done.held_out_deg:.4f} deg")
+        step = add_hand_eye(session, board_of(rig), calibration, report, kind)
+    done, advice = step.record, step.advice
+    say(
+        f"hand-eye from {done.views} views: held out {done.held_out_mm:.3f} mm, {done.held_out_deg:.4f} deg;"
+        f" 95 % within {step.intervals.half_mm.max():.3f} mm, {step.intervals.half_deg.max():.4f} deg an axis"
+    )
+    pose = ", ".join(f"{value:.4f}" for value in advice.T_base_tcp.as_pose6())
+    say(f"next view, the one that would tell most: {advice.reason}; tool at [{pose}] (m, rad) if it is free")
     _apply(calibration, apply)
 
 

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from calibration.board import BoardSpec
 from calibration.detection import Detection
 from calibration.intrinsics import calibrate_intrinsics
+from calibration.view_selection import select_views
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3
 
@@ -80,3 +82,40 @@ def test_a_board_that_was_never_tilted_is_refused(world):
 def test_views_of_another_resolution_are_refused(world):
     with pytest.raises(CalibrationError, match="outside a 1224x1024 image"):
         calibrate_intrinsics(_views(world, 0), world.spec, (1024, 1224))
+
+
+@pytest.mark.parametrize("level", [1, 2, 4, 8])
+def test_every_level_projects_to_the_centre_of_its_blocks_exactly(world, level):
+    """A level x level block of mosaic pixels is one pixel of the level, and their centres agree: a point seen
+    there must project to integer coordinates, half pixels included."""
+    camera = world.intrinsics
+    blocks = np.array([[0, 0], [3, 5], [100, 40], [2048 // level - 1, 1024 // level]], float)
+    centres = level * blocks + (level - 1) / 2
+    points = camera.rays(centres) * np.array([[0.4], [0.5], [0.6], [1.3]])
+    np.testing.assert_allclose(camera.at(level).project(points), blocks, atol=1e-6)
+    np.testing.assert_allclose(camera.at(2).at(2).K, camera.at(4).K, atol=1e-9)
+
+
+def test_the_views_selected_cover_more_than_as_many_in_a_row(world):
+    rng = np.random.default_rng(4)
+    poses = world.views(8, rng)
+    jitter = SE3.exp(rng.normal(0, 1e-3, (72, 6)))
+    crowded = [world.detection(pose, rng) for pose in poses[np.repeat(np.arange(8), 9)] @ jitter]
+    chosen = select_views(crowded, world.spec, 8)
+    assert sorted(np.unique(chosen // 9)) == list(range(8))
+    assert list(select_views(crowded[:5], world.spec, 8)) == list(range(5))
+
+
+def test_a_board_described_with_another_aspect_is_refused(world):
+    """Squares that are not square, as a printer's fit to the page makes them."""
+    stretched = [Detection(d.ids, d.pixels) for d in _views(world, 5)]
+    wrong = BoardSpec(12, 8, world.spec.square_m, world.spec.marker_m, "DICT_5X5_100")
+    with pytest.raises(CalibrationError, match="squares_x"):
+        calibrate_intrinsics(stretched, wrong, SIZE)
+
+
+def test_corners_that_are_nan_are_refused_by_view(world):
+    detections = _views(world, 6)
+    detections[3].pixels[2] = np.nan
+    with pytest.raises(CalibrationError, match="view 3 has fewer than 6 finite corners"):
+        calibrate_intrinsics(detections, world.spec, SIZE)

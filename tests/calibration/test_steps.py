@@ -54,7 +54,7 @@ def test_a_view_taken_in_motion_is_skipped_and_every_overlay_shows_its_own_view(
 ) -> None:
     calibration = tmp_path / "calibration.json"
     add_intrinsics(stills[0], world.spec, calibration)
-    record = add_hand_eye(shaken, world.spec, calibration)
+    record = add_hand_eye(shaken, world.spec, calibration).record
     with Session.open(shaken) as session:
         views, _ = views_at_rest(session, detect_session(session, world.spec))
     assert [index for index, _ in views] == [0, 1, 3, 4, 5, 6]

@@ -39,10 +39,7 @@ class AravisCamera(QueuedCamera):
         self._device_features = AravisFeatures(name, self._error)
         super().__init__(config, name, self._device_features)
 
-    def close(self) -> None:
-        """See `Camera.close`. Aravis goes on for about 8 s to tell a camera that is gone: in a thread, for
-        which only the end of the whole process waits."""
-        self.stop()
+    def _release(self) -> None:
         objects = [self._camera, self._device_features.detach()]
         self._camera = None
         self._let_go(objects)
@@ -118,8 +115,8 @@ class AravisCamera(QueuedCamera):
         self._let_go([grabber.stop()])
 
     def _let_go(self, objects: list[Any]) -> None:
-        """Drops the last references to Aravis' objects, which then say goodbye to the camera: in a thread of
-        its own where nobody listens."""
+        """Drops the last references to Aravis' objects, which then say goodbye to the camera. Where nobody
+        listens that takes about 8 s: in a thread, for which only the end of the whole process waits."""
         if self._lost:
             threading.Thread(target=objects.clear, name="let-go-of-camera", daemon=True).start()
 

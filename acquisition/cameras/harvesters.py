@@ -49,9 +49,7 @@ class HarvestersCamera(QueuedCamera):
         self._nodes = GenTLFeatures(name, self._gentl)
         super().__init__(config, name, self._nodes)
 
-    def close(self) -> None:
-        """See `Camera.close`."""
-        self.stop()
+    def _release(self) -> None:
         self._nodes.detach()
         acquirer, self._acquirer = self._acquirer, None
         harvester, self._harvester = self._harvester, None

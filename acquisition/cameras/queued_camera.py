@@ -35,18 +35,13 @@ class QueuedCamera(Camera):
         self._name = name
         self._features: Features = features
         self._info: CameraInfo
-        self._running = False
-        self._lost = False
+        self._opened = self._running = self._lost = False
         self._trigger: Trigger = config.trigger
         self._frames = FrameQueue()
         self._ids = FrameIds()
         self._epochs = ClockEpochs()
         self._underruns = 0
-        try:
-            self._open()
-        except BaseException:
-            self.close()
-            raise
+        self._try_to_open()
 
     @property
     def info(self) -> CameraInfo:
@@ -61,6 +56,8 @@ class QueuedCamera(Camera):
 
     def start(self, trigger: Trigger | None = None) -> None:
         """See `Camera.start`."""
+        if not self._opened:
+            raise DeviceError(f"{self._name} is closed; open it again")
         if self._running:
             raise DeviceError(f"{self._name} is already started; stop it first")
         self._frames, self._ids, self._underruns = FrameQueue(), FrameIds(), 0
@@ -105,6 +102,12 @@ class QueuedCamera(Camera):
             self._underruns += self._count_underruns()
             self._end()
 
+    def close(self) -> None:
+        """See `Camera.close`."""
+        self.stop()
+        self._opened = False
+        self._release()
+
     def reconnect(self, timeout_s: float = 15.0) -> None:
         """See `Camera.reconnect`."""
         running, before = self._running, self._info
@@ -117,6 +120,7 @@ class QueuedCamera(Camera):
                 f"{self._name} is {self._info.model} {self._info.serial} now and was {before.model} "
                 f"{before.serial}; give each camera an address of its own"
             )
+        self._frames.recover()
         self._ids.resume()
         self._epochs.restart()
         if running:
@@ -125,13 +129,20 @@ class QueuedCamera(Camera):
     def _open_again(self, deadline: float) -> None:
         while True:
             try:
-                self._open()
+                self._try_to_open()
                 return
             except DeviceError:
-                self.close()
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(_RETRY_S)
+
+    def _try_to_open(self) -> None:
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+        self._opened = True
 
     def _go(self) -> None:
         """Starts the acquisition with the queue, ids and clock there are."""
@@ -154,7 +165,11 @@ class QueuedCamera(Camera):
 
     @abstractmethod
     def _open(self) -> None:
-        """Connects, configures and describes the camera in `_info`; `close` follows where it raises."""
+        """Connects, configures and describes the camera in `_info`; `_release` follows where it raises."""
+
+    @abstractmethod
+    def _release(self) -> None:
+        """Lets go of whatever `_open` got hold of, however far it came. Idempotent."""
 
     @abstractmethod
     def _begin(self, image: settings.ImageSettings) -> None:

@@ -18,7 +18,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ from dataset.polarimetry import Raw
 
 if TYPE_CHECKING:
     from acquisition.simulation.patterns import FrameSource
+
+Number = TypeVar("Number", int, float)
 
 _PRIORITY = -5  # a camera keeps its time however busy the host is
 DEFAULT_SOURCE = "acquisition.simulation.patterns:MovingPattern"
@@ -194,10 +196,13 @@ def _serve(options: argparse.Namespace) -> None:
     device.set_ptp_master(_yes(options.ptp_master))
 
     def jump(seconds: float) -> None:
-        sensor.clock = sensor.clock.jumped(seconds)
+        clock = sensor.clock.jumped(seconds)
+        if clock.to_camera(time.monotonic_ns()) < 0:
+            raise ValueError(f"a camera's clock counts from 0; it has not yet run {-seconds:g} s")
+        sensor.clock = clock
 
     def set_on_sensor(name: str) -> Callable[[str], None]:
-        return lambda value: setattr(sensor, name, float(value))
+        return lambda value: setattr(sensor, name, _not_negative(float(value)))
 
     faults: dict[str, Callable[[str], None]] = {
         "lost-ratio": lambda value: device.set_lost_ratio(float(value)),
@@ -205,7 +210,7 @@ def _serve(options: argparse.Namespace) -> None:
         "stall": set_on_sensor("stall_s"),
         "clock-jump": lambda value: jump(float(value)),
         "stuck-auto": lambda value: device.stick_exposure_auto(_yes(value)),
-        "payload-padding": lambda value: device.pad_payload(int(value)),
+        "payload-padding": lambda value: device.pad_payload(_not_negative(int(value))),
         "ptp-master": lambda value: device.set_ptp_master(_yes(value)),
     }
 
@@ -225,6 +230,12 @@ def _serve(options: argparse.Namespace) -> None:
 
     with contextlib.closing(device):
         serve_commands(handle)
+
+
+def _not_negative(value: Number) -> Number:
+    if not value >= 0:
+        raise ValueError(f"{value} must not be negative")
+    return value
 
 
 def _yes(value: str) -> bool:

@@ -120,6 +120,8 @@ class TestEveryCamera:
             camera.stop()
         camera.close()
         camera.close()
+        with pytest.raises(DeviceError, match="is closed; open it again"):
+            camera.start()
 
     def test_refuses_a_format_and_a_rate_that_it_has_not(self, opener: Open) -> None:
         with pytest.raises(DeviceError, match=r"has no pixel format Mono12Packed; it offers .*Mono8"):

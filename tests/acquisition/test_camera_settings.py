@@ -151,10 +151,29 @@ def test_frames_tell_when_the_cameras_clock_jumped(simulated_camera: SimulatedCa
     with AravisCamera(CameraConfig(ADDRESS, frame_rate=100)) as camera:
         camera.start()
         epochs = []
-        for jump_s in (3600.0, -7200.0):
+        for jump_s in (7200.0, -3600.0):
             epochs += [camera.read().clock_epoch for _ in range(5)]
             simulated_camera.jump_clock(jump_s)
             epochs += [camera.read().clock_epoch for _ in range(30)]
         assert epochs == sorted(epochs)
         assert (epochs[0], epochs[-1]) == (0, 2)
-    simulated_camera.jump_clock(3600.0)
+    simulated_camera.jump_clock(-3600.0)
+
+
+@pytest.mark.parametrize(
+    ("line", "match"),
+    [
+        ("clock-jump -1e6", "counts from 0"),
+        ("stall -1", "must not be negative"),
+        ("stall soon", "could not convert"),
+        ("payload-padding -4", "must not be negative"),
+        ("ptp-master maybe", "neither yes nor no"),
+        ("explode", "use one of clock, statistics, lost-ratio"),
+    ],
+)
+def test_a_command_that_makes_no_sense_is_refused_and_does_no_harm(
+    simulated_camera: SimulatedCamera, line: str, match: str
+) -> None:
+    with pytest.raises(DeviceError, match=match):
+        simulated_camera.command(line)
+    assert simulated_camera.command("statistics").startswith("frames ")

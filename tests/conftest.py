@@ -47,11 +47,11 @@ def browser_page() -> Iterator[Page]:
 
 @pytest.fixture(scope="session")
 def shown_images() -> Callable[[Page], list[NDArray[np.uint8]]]:
-    """The images that a page shows, icons left out, in their own resolution: (h, w, 3) BGR."""
+    """The images that a page was sent, in their own resolution: (h, w, 3) BGR."""
 
     def images(page: Page) -> list[NDArray[np.uint8]]:
         urls = page.evaluate(
-            """() => [...document.images].filter(image => image.naturalWidth > 150).map(image => {
+            """() => [...document.images].filter(image => image.src.startsWith("blob:")).map(image => {
                 const canvas = document.createElement("canvas");
                 [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
                 canvas.getContext("2d").drawImage(image, 0, 0);

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from acquisition.trajectories import look_at
 from dataset import SE3, Intrinsics
+from dataset.pictures import Picture, angle, degree, in_colour, intensity
 from dataset.polarimetry import Stokes, decode, remap, superpixel
 from s2p3 import objects, pictures
 from s2p3.lab.rig import BOARD
 from s2p3.lab.scene import LabScene
 from s2p3.lab.truth import LabTruth, sample_truth
-from s2p3.pictures import Picture
 from s2p3.rendering import rasterize
 from s2p3.synthesis import SYNTHETIC, draw_frame
 from s2p3.synthesis.generate import BITS, PAPER_CAMERA
@@ -99,9 +99,9 @@ def measured(truth: LabTruth, T_base_cam: SE3) -> tuple[Stokes, Intrinsics]:
 def polarization_tiles(stokes: Stokes) -> dict[str, Picture]:
     """Intensity, degree and angle of polarization."""
     return {
-        "intensity": np.dstack([pictures.intensity(stokes)] * 3),
-        "degree (DoLP)": pictures.degree(stokes),
-        "angle (AoLP)": pictures.angle(stokes),
+        "intensity": in_colour(intensity(stokes)),
+        "degree (DoLP)": degree(stokes),
+        "angle (AoLP)": angle(stokes),
     }
 
 

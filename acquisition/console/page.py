@@ -241,13 +241,12 @@ class ConsolePage:
         return f"{self._kind.value}-{number:03d}"
 
     def _do(self, action: Callable[[], object]) -> None:
-        """What a button does; where it cannot be done, the page says why."""
+        """What a button does, in a thread of the server's; where it cannot be done, the page says why."""
         try:
             action()
             self._refused = ""
         except ToolkitError as error:
             self._refused = str(error)
-        self.update()
 
 
 def _drawn(stokes: Stokes, blown: NDArray[np.bool_], view: str) -> Picture:

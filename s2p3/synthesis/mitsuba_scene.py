@@ -25,7 +25,7 @@ _WALL_DEG = (
     30.0,
     40.0,
 )  # elevations between which the wall stands, and where it has faded into the sky
-_SMOOTHEST = 0.02
+_SMOOTHEST = 0.002
 _BOUNCES, _BOUNCES_IN_GLASS = 6, 14
 
 
@@ -124,12 +124,12 @@ def bsdf(surface: Surface, reflectance: Any = None) -> dict[str, Any]:
 
 def _table(mi: Any, scene: Scene) -> dict[str, Any]:
     parameters = scene.parameters
-    # Mitsuba's v runs against the rows of a bitmap; our texture's middle is at the table's origin
+    # our texture's middle is at the table's origin
     repeats = _TABLE_M / parameters.texture_m
     middle = 0.5 - 0.5 * repeats
     texture = {
         "type": "bitmap",
-        "bitmap": _bitmap(mi, parameters.texture[::-1]),
+        "bitmap": _bitmap(mi, parameters.texture),
         "wrap_mode": "mirror",
         "to_uv": mi.ScalarTransform4f().translate([middle, middle, 0]).scale([repeats, repeats, 1]),
     }

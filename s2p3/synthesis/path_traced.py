@@ -68,7 +68,7 @@ class PathTraced:
         mi = self.engine.start()
         sensor = sensor_dict(mi, scene.intrinsics, scene.T_cam_table.inverse(), self.samples)
         stokes = render_stokes(mi, scene_dict(mi, scene) | {"sensor": sensor}, seed)
-        return in_ray_frames(_to_rectangular(stokes, scene.intrinsics), scene.rays)
+        return in_ray_frames(to_rectangular(stokes, scene.intrinsics), scene.rays)
 
 
 def render_stokes(mi: Any, scene: dict[str, Any], seed: int) -> Image:
@@ -99,7 +99,7 @@ def in_ray_frames(stokes: Image, rays: Image) -> Image:
     return np.stack([s0, c * s1 - s * s2, s * s1 + c * s2]).astype(np.float32)
 
 
-def _to_rectangular(stokes: Image, intrinsics: Intrinsics) -> Image:
+def to_rectangular(stokes: Image, intrinsics: Intrinsics) -> Image:
     """Stretches rows where the two focal lengths differ by something that shows."""
     fx, fy, cy = intrinsics.K[0, 0], intrinsics.K[1, 1], intrinsics.K[1, 2]
     if abs(fy / fx - 1) * intrinsics.height / 2 < _SQUARE_PX:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,8 @@ _PERIOD_S = 0.12
 """Between two pictures (our choice: live to the eye, and a tenth of a core)."""
 _RECORDING_PERIOD_S = 0.3
 """The same while recording, whose threads need the cores more."""
+_CALM_PERIOD_S = 0.5
+"""Between two changes of what need not be fluent, so that a slow browser keeps up with what must be."""
 _VIEWS = ("S0", "DoLP", "AoLP")
 _PAUSE, _RESUME = "❚❚ Pause", "▶ Resume"
 _BINS = 40
@@ -73,6 +76,7 @@ class ConsolePage:
         self._server = server
         self._station = station
         self._shown: RawFrame | None = None
+        self._calm_until_s = 0.0
         self._arm_before: RobotSample | None = None
         self._refused = ""
         server.gui.configure_theme(dark_mode=True, show_share_button=False, brand_color=(74, 144, 217))
@@ -87,13 +91,16 @@ class ConsolePage:
 
     def update(self) -> None:
         """Shows how things are now."""
-        self._update_words()
+        calm = time.monotonic() < self._calm_until_s
+        if not calm:
+            self._calm_until_s = time.monotonic() + _CALM_PERIOD_S
+            self._update_words()
         self._update_arm()
         latest, info = self._station.camera.latest, self._station.camera.info
         if latest is not None and info is not None and latest is not self._shown:
             self._shown = latest
             try:
-                self._update_pictures(latest, info)
+                self._update_pictures(latest, info, calm)
             except ToolkitError as error:  # a format without an intensity
                 self._refused = str(error)
 
@@ -177,21 +184,20 @@ class ConsolePage:
             "/board", corners, np.array([[0, 1, 2], [0, 2, 3]]), color=(225, 225, 225), side="double"
         )
 
-    def _update_pictures(self, frame: RawFrame, info: CameraInfo) -> None:
+    def _update_pictures(self, frame: RawFrame, info: CameraInfo, calm: bool) -> None:
         stokes = decode_frame(frame.pixels, info)
         blown = pictures.saturated(stokes)
         view = self._view.value
         shown = stage.rgb(_drawn(stokes, blown, view))
-        dark = stokes.s0 < DARK
+        self._picture.image = shown
+        if calm:
+            return
+        _say(self._legend, words.legend(view))
+        _say(self._exposure_words, words.exposure(float(blown.mean()), float((stokes.s0 < DARK).mean())))
         usable = stokes.dolp[stokes.valid]
         counts, edges = np.histogram(usable, bins=_BINS, range=(0, 1))
-        self._picture.image = shown
-        _say(self._legend, words.legend(view))
-        _say(self._exposure_words, words.exposure(float(blown.mean()), float(dark.mean())))
-        self._histogram.data = (
-            0.5 * (edges[1:] + edges[:-1]),
-            np.maximum(100.0 * counts / max(1, len(usable)), _LEAST),
-        )
+        percent = np.maximum(100.0 * counts / max(1, len(usable)), _LEAST)
+        self._histogram.data = (0.5 * (edges[1:] + edges[:-1]), percent)
         if self._camera.visible:
             small = max(1, shown.shape[1] // _SMALL_PX)
             self._camera.image = np.ascontiguousarray(shown[::small, ::small])
@@ -204,11 +210,11 @@ class ConsolePage:
         if sample is not None and pose is not None:
             self._arm.move(sample.q)
             stage.place(self._camera, pose)
-        self._arm_before = sample
 
     def _update_words(self) -> None:
         station = self._station
         motion = words.motion(self._arm_before, station.arm.latest)
+        self._arm_before = station.arm.latest
         _say(self._device_words, words.devices(station, motion))
         covered = int((station.coverage > 0).sum())
         _say(self._recording_words, words.recording(station.recording, covered, len(VIEWS)))

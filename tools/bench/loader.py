@@ -36,7 +36,9 @@ OBJECT = "cup"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", type=int, default=128, help="side of the network's input, pixels")
+    parser.add_argument(
+        "--size", type=int, choices=(64, 128, 256), default=128, help="side of the network's input, pixels"
+    )
     parser.add_argument("--frames", type=int, default=96, help="frames of the session")
     parser.add_argument("--seconds", type=float, default=10.0, help="for each measurement")
     parser.add_argument("--json", action="store_true")
@@ -57,7 +59,11 @@ def main() -> None:
 def measure(path: Path, size: int, seconds: float) -> dict[str, float]:
     """The rates, in images and megabytes of pixels a second."""
     model, config = build(OBJECT), fast()
-    config = replace(config, input=replace(config.input, size=size, canonical_size=size * 3 // 2))
+    config = replace(
+        config,
+        input=replace(config.input, size=size, canonical_size=size * 3 // 2),
+        network=replace(config.network, total_stride=32 if size == 256 else 16),  # 32 as published
+    )
     data = CropDataset([path], model, config.input)
     loader = crop_loader(data, BATCH)
     batches = iter(loader)

@@ -5,6 +5,7 @@ from calibration.board import BoardSpec
 from calibration.detection import Detection, detect, detect_in_mosaic
 from calibration.hand_eye import HandEyeResult, calibrate_hand_eye
 from calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
+from calibration.next_pose import NextPose, next_pose
 from calibration.object_pose import ObjectPoseResult, register_points
 from calibration.polarizer import PolarizerResult, calibrate_polarizer
 from calibration.records import (
@@ -17,6 +18,7 @@ from calibration.records import (
     ToolTipRecord,
 )
 from calibration.result import Calibration
+from calibration.robot_world import RobotWorldResult, solve_robot_world
 from calibration.sessions import (
     camera_poses,
     detect_session,
@@ -24,6 +26,7 @@ from calibration.sessions import (
     intrinsics_from_session,
     time_offset_from_session,
 )
+from calibration.streams import solve_streams
 from calibration.time_offset import TimeOffsetResult, estimate_time_offset
 from calibration.tool_tip import ToolTipResult, calibrate_tool_tip
 from calibration.touches import KnownTip, object_from_touches, tool_tip_from_session
@@ -37,10 +40,12 @@ __all__ = [
     "IntrinsicsRecord",
     "IntrinsicsResult",
     "KnownTip",
+    "NextPose",
     "ObjectPoseRecord",
     "ObjectPoseResult",
     "PolarizerRecord",
     "PolarizerResult",
+    "RobotWorldResult",
     "Source",
     "TimeOffsetRecord",
     "TimeOffsetResult",
@@ -58,8 +63,11 @@ __all__ = [
     "estimate_time_offset",
     "hand_eye_from_session",
     "intrinsics_from_session",
+    "next_pose",
     "object_from_touches",
     "register_points",
+    "solve_robot_world",
+    "solve_streams",
     "time_offset_from_session",
     "tool_tip_from_session",
 ]

@@ -17,7 +17,7 @@ from calibration import (
 )
 from calibration.report import ViewPicture, calibration_report
 from calibration.sessions import arm_trace, rest_pose
-from calibration.touches import read_points, touched_points
+from calibration.touches import KnownTip, read_points, touched_points
 from dataset.errors import CalibrationError
 from dataset.session import Session
 from dataset.transforms import rotation_error_deg, translation_error_mm
@@ -92,7 +92,7 @@ def test_camera_poses_carry_their_uncertainty(world, stills, calibrated):
 def test_touches_are_the_tips_place_at_rest(stills):
     path, true_arm = stills
     with Session.open(path) as session:
-        points = touched_points(session, [0.0, 0.0, 0.1])
+        points = touched_points(session, KnownTip.exactly([0.0, 0.0, 0.1])).points
     np.testing.assert_allclose(points, true_arm.apply(np.tile([0, 0, 0.1], (len(true_arm), 1))), atol=3e-4)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -60,7 +61,8 @@ def serve_console(rig: Rig, out: Path, address: Address, ready: Callable[[str], 
     with page_server(address, "S²P³ console") as server, Station(rig, out) as station:
         page = ConsolePage(server, station, rig)
         ready(address.url)
-        page.run(threading.Event())
+        with contextlib.suppress(KeyboardInterrupt):
+            page.run(threading.Event())
 
 
 class ConsolePage:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -49,7 +50,8 @@ def serve_viewer(path: Path, address: Address, ready: Callable[[str], object]) -
         with page_server(address, path.name) as server:
             page = ViewerPage(server, look)
             ready(address.url)
-            page.run(threading.Event())
+            with contextlib.suppress(KeyboardInterrupt):
+                page.run(threading.Event())
 
 
 class ViewerPage:

@@ -5,10 +5,11 @@
 
 Generates KinHEC's smoke tier (or another), runs its reference solvers by its own protocol and this
 toolkit's solvers on the same measurements, and prints, a track, the median error of the hand-eye transform
-in degrees and millimetres. The toolkit is given what a user of the track would have: pairs of poses;
-where poses come from corners, the camera and the target, too; where clocks differ, the two streams with their times, never the true
-offset; and for visual odometry the fact that its scale is unknown. A reference is the best of all solvers in
-each number, on the sequences the toolkit did not refuse, with the true clock offset where that is better.
+in degrees and millimetres. The toolkit is given what a user of the track would have: pairs of poses; where
+poses come from corners, the camera and the target, too; where clocks differ, the two streams with their
+times, never the true offset; and for visual odometry the fact that its scale is unknown. A reference is the
+best of all solvers in each number, on the sequences the toolkit did not refuse, with the true clock offset
+where that is better.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 
 from dataset.errors import ToolkitError
-from s2p3.commands import calibrate, capture, console, demo, devices, exchange, learn, sessions
+from s2p3.commands import calibrate, capture, console, demo, devices, exchange, learn, sessions, use
 
 Verb = Callable[..., Any]
 
@@ -80,7 +80,7 @@ VERBS: dict[str, Verb | Group] = {
             "self-supervised": learn.train_self_supervised,
         },
     ),
-    "evaluate": learn.evaluate,
+    "evaluate": use.evaluate,
 }
 
 _DESCRIPTION = (

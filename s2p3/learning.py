@@ -10,7 +10,8 @@ from pathlib import Path
 from dataset.errors import SessionError
 from dataset.session import Session
 from s2p3.config import SelfSupervisionConfig
-from s2p3.evaluation import Evaluation, evaluate, find_objects
+from s2p3.evaluation import Estimator, Evaluation, evaluate, find_objects
+from s2p3.evaluation.evaluate import targets_of
 from s2p3.objects import ObjectModel
 from s2p3.training import captured_crops, self_supervise
 from s2p3.training.checkpoint import read_info
@@ -55,6 +56,9 @@ def evaluate_split(
     """
     with Session.open(session) as opened:
         indices = frames_of(opened, split)
+        targets_of(opened, indices, opened.object_poses(model.name), model.name)
+        for network in networks.values():
+            Estimator.load(network, model.name)  # a mistake is told before the detector has run
         found = find_objects(opened, indices, detector, model.name)
         return {
             name: evaluate(opened, indices, model, network, detector, found)

@@ -1,4 +1,4 @@
-"""`s2p3 synthesize`, `s2p3 train ...` and `s2p3 evaluate`: from an object to a pose model."""
+"""`s2p3 synthesize` and `s2p3 train ...`: from an object to a pose model."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from s2p3.commands.arguments import ObjectName, OptionalPath, Sessions, at_least
-from s2p3.commands.output import counting, say, show
+from s2p3.commands.output import counting, say
 
 if TYPE_CHECKING:
     from s2p3.config import ExperimentConfig
@@ -235,41 +235,6 @@ def train_self_supervised(
     model = named_object(object, mesh)
     settings = None if config is None else load(config).self_supervision
     say(str(adapt(session, split, model, detector, teacher, student, out, settings)))
-
-
-def evaluate(
-    session: tyro.conf.Positional[Path],
-    *,
-    object: ObjectName,
-    network: Path,
-    detector: Path,
-    mesh: OptionalPath = None,
-    split: str = "test",
-    out: OptionalPath = None,
-    json: bool = False,
-) -> None:
-    """Evaluate a teacher or student on an annotated session, in detected boxes; every target counts.
-
-    Args:
-        session: an annotated session.
-        object: cup, fork, knife, bottle, or the name of the object in --mesh.
-        network: checkpoint of a teacher or student.
-        detector: detector.safetensors.
-        mesh: PLY, OBJ or STL of the object, metres.
-        split: name of the split to evaluate on.
-        out: JSON file for the summary and a record of every target.
-        json: print the summary as JSON.
-    """
-    from dataclasses import asdict
-
-    from s2p3.learning import evaluate_split
-    from s2p3.objects import named_object
-
-    networks = {"network": network}
-    result = evaluate_split(session, split, named_object(object, mesh), networks, detector)["network"]
-    if out is not None:
-        result.save(out)
-    show(asdict(result.summary), json)
 
 
 def _some(sessions: list[Path]) -> list[Path]:

@@ -7,6 +7,7 @@ that shows the object is a target; one without an estimate counts as failed.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from dataset import SE3
 from dataset.errors import ToolkitError
-from dataset.session import Session
+from dataset.session import ObjectPoses, Session
 from s2p3.evaluation import metrics
-from s2p3.evaluation.metrics import Summary
+from s2p3.evaluation.metrics import Floats
 from s2p3.evaluation.predict import Estimator, Finder
+from s2p3.evaluation.records import Record, Ruler, Subject
+from s2p3.evaluation.summary import Difference, Summary, differences, grouped, of_same_targets, summarize
 from s2p3.networks.detector import Detection
 from s2p3.objects import ObjectModel
 from s2p3.training.progress import OnStep, reporting
@@ -27,46 +29,52 @@ from s2p3.training.progress import OnStep, reporting
 MINIMUM_VISIBLE = 0.1
 """Share of the silhouette from which a frame is a target, as in the BOP challenge."""
 
-METRIC_POINTS = 1000
-"""Points on the surface over which ADD and ADD-S are averaged."""
-
-
-@dataclass(frozen=True)
-class Record:
-    """One target.
-
-    Attributes:
-        frame: index in the session.
-        visible_fraction: of the silhouette.
-        box_xywh: the detected box, or None where nothing was detected.
-        T_cam_obj: the estimate, 4x4 as nested tuples, or None.
-        error_m: ADD or ADD-S, see `Summary.metric`; infinite where missed.
-        rotation_deg, translation_mm, depth_mm: errors, the last signed; NaN where missed.
-    """
-
-    frame: int
-    visible_fraction: float
-    box_xywh: tuple[float, ...] | None
-    T_cam_obj: tuple[tuple[float, ...], ...] | None
-    error_m: float
-    rotation_deg: float
-    translation_mm: float
-    depth_mm: float
+KNOWN_VIEWS = "train"
+"""Split whose views the new ones are measured from."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """All targets of a split, and what they come to."""
 
+    subject: Subject
     summary: Summary
     records: tuple[Record, ...]
 
+    @staticmethod
+    def of(records: Sequence[Record], subject: Subject) -> Evaluation:
+        """The evaluation that consists of `records`; at least one."""
+        return Evaluation(subject, summarize(records, subject), tuple(records))
+
+    @property
+    def errors_m(self) -> Floats:
+        """(N,) ADD or ADD-S, as the subject says; infinite where missed."""
+        return np.array([record.error_m(self.subject.metric) for record in self.records])
+
+    def groups(self) -> dict[str, dict[str, Summary]]:
+        """Summaries by how the targets are seen, see `summary.grouped`."""
+        return grouped(self.records, self.subject)
+
+    def paired_with(self, other: Evaluation) -> bool:
+        """Whether both are of the same targets."""
+        return of_same_targets(self.records, other.records, self.subject, other.subject)
+
+    def above(self, other: Evaluation) -> dict[str, Difference]:
+        """Every figure minus the other evaluation's, paired. Raises ToolkitError: of other targets."""
+        return differences(self.records, other.records, self.subject, other.subject)
+
     def save(self, path: Path) -> None:
-        """Writes JSON: the summary, and every record (an infinite error as null)."""
-        rows = [{**asdict(record), "error_m": _finite(record.error_m)} for record in self.records]
-        rows = [{name: _finite(value) for name, value in row.items()} for row in rows]
-        text = json.dumps({"summary": asdict(self.summary), "records": rows}, indent=1)
-        path.write_text(text, encoding="utf-8")
+        """Writes JSON: subject, summary, summaries by group, every record; null for what is not finite."""
+        content = {
+            "subject": asdict(self.subject),
+            "summary": asdict(self.summary),
+            "groups": {
+                title: {name: asdict(summary) for name, summary in group.items()}
+                for title, group in self.groups().items()
+            },
+            "records": [record.to_json() for record in self.records],
+        }
+        path.write_text(json.dumps(finite(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
     @staticmethod
     def load(path: Path) -> Evaluation:
@@ -76,8 +84,8 @@ class Evaluation:
         """
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            summary = Summary(**content["summary"])
-            return Evaluation(summary, tuple(_record_from(row) for row in content["records"]))
+            subject = Subject(**content["subject"])
+            return Evaluation.of([Record.from_json(row) for row in content["records"]], subject)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ToolkitError(f"{path} is no saved evaluation ({error}); evaluate again") from error
 
@@ -111,8 +119,8 @@ def evaluate(
 
     Args:
         indices: of the frames, usually a split.
-        network: checkpoint of the teacher or student.
-        detector: checkpoint of the detector.
+        network: checkpoint or ONNX file of the teacher or student.
+        detector: checkpoint or ONNX file of the detector.
         detections: the detector's answers for `indices` where `find_objects` has been run already.
 
     Raises ToolkitError: no frame of `indices` shows the object; checkpoints missing or of another object.
@@ -120,87 +128,50 @@ def evaluate(
     estimate = Estimator.load(network, model.name)
     find = Finder.load(detector, model.name)
     poses = session.object_poses(model.name)
-    points = model.surface_points(METRIC_POINTS)
-    targets = [i for i, index in enumerate(indices) if poses.visible_fraction[index] >= MINIMUM_VISIBLE]
-    if not targets:
-        raise ToolkitError(
-            f"{session.path}: none of the {len(indices)} frames shows {model.name!r}; choose another split"
-        )
+    targets = targets_of(session, indices, poses, model.name)
+    camera = session.working_intrinsics
+    ruler = Ruler(model, camera, _known_views(session, poses))
     records = []
     with reporting("evaluation", len(targets), on_step) as report:
         for count, position in enumerate(targets, start=1):
             index = int(indices[position])
             stokes = session.stokes(index).stack()
             detection = find(stokes) if detections is None else detections[position]
-            found = None if detection is None else estimate(stokes, detection, session.working_intrinsics)
-            visible = float(poses.visible_fraction[index])
-            pose = None if found is None else found.T_cam_obj
-            box = None if found is None else found.detection.box_xywh
-            records.append(_record(index, visible, box, pose, poses.T_cam_obj[index], points, model))
+            found = None if detection is None else estimate(stokes, detection, camera)
+            true = poses.T_cam_obj[index]
+            sight = ruler.sight(index, float(poses.visible_fraction[index]), true)
+            if found is None:
+                records.append(Record.missed(sight))
+            else:
+                box = found.detection.box_xywh
+                records.append(ruler.record(sight, found.T_cam_obj, true, box, found.score))
             report(count, len(targets), {})
-    return Evaluation(summarize(records, model), tuple(records))
+    return Evaluation.of(records, Subject.of(model, camera.width, session.session_id))
 
 
-def metric_name(model: ObjectModel) -> str:
-    """Which metric the object is judged by."""
-    return "ADD-S" if model.symmetry.any else "ADD"
+def targets_of(session: Session, indices: Sequence[int], poses: ObjectPoses, object_name: str) -> list[int]:
+    """Positions in `indices` of the frames that show enough of the object.
+
+    Raises ToolkitError: there are none.
+    """
+    targets = [i for i, index in enumerate(indices) if poses.visible_fraction[index] >= MINIMUM_VISIBLE]
+    if not targets:
+        raise ToolkitError(
+            f"{session.path}: none of the {len(indices)} frames shows {object_name!r}; choose another split"
+        )
+    return targets
 
 
-def summarize(records: Sequence[Record], model: ObjectModel) -> Summary:
-    """What `records` come to."""
-    errors = np.array([record.error_m for record in records])
-    found = [record for record in records if record.T_cam_obj is not None]
-
-    def median(name: str) -> float:
-        return float(np.median([getattr(record, name) for record in found])) if found else float("nan")
-
-    return Summary(
-        metric=metric_name(model),
-        targets=len(records),
-        missed=len(records) - len(found),
-        recall_10=metrics.recall(errors, 0.1 * model.diameter),
-        recall_5=metrics.recall(errors, 0.05 * model.diameter),
-        rotation_deg=median("rotation_deg"),
-        translation_mm=median("translation_mm"),
-        depth_mm=median("depth_mm"),
-    )
+def finite(value: Any) -> Any:
+    """The same value, with None for every number in it that is not finite, as JSON needs."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _record(
-    frame: int,
-    visible: float,
-    box: np.ndarray | None,
-    found: SE3 | None,
-    true: SE3,
-    points: metrics.Floats,
-    model: ObjectModel,
-) -> Record:
-    if found is None or box is None:
-        nan = float("nan")
-        return Record(frame, visible, None, None, float("inf"), nan, nan, nan)
-    estimated, wanted = SE3.stack([found]), SE3.stack([true])
-    distance = metrics.add_s if model.symmetry.any else metrics.add
-    offset = 1e3 * (found.translation - true.translation)
-    return Record(
-        frame=frame,
-        visible_fraction=visible,
-        box_xywh=tuple(float(value) for value in box),
-        T_cam_obj=tuple(tuple(float(value) for value in row) for row in found.as_matrix()),
-        error_m=float(distance(estimated, wanted, points)[0]),
-        rotation_deg=float(metrics.rotation_error_deg(estimated, wanted, model.symmetry)[0]),
-        translation_mm=float(np.linalg.norm(offset)),
-        depth_mm=float(offset[2]),
-    )
-
-
-def _record_from(row: dict[str, Any]) -> Record:
-    """A record as `Evaluation.save` wrote it; null stands for what was not finite."""
-    errors = ("rotation_deg", "translation_mm", "depth_mm")
-    numbers = {name: float("nan") for name in errors if row[name] is None}
-    if row["error_m"] is None:
-        numbers["error_m"] = float("inf")
-    return Record(**{**row, **numbers})
-
-
-def _finite(value: object) -> object:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def _known_views(session: Session, poses: ObjectPoses) -> Floats:
+    known = session.splits.get(KNOWN_VIEWS)
+    seen = poses.T_cam_obj[np.zeros(0, np.int64) if known is None else known]
+    return metrics.viewing_direction(seen[seen.finite])

@@ -1,23 +1,38 @@
-"""How wrong a pose is: ADD, ADD-S, rotation, translation, signed depth; and what share of the targets is
-right.
+"""How wrong a pose is, and what share of the targets is right.
 
-ADD (Hinterstoisser et al. 2012) for objects without symmetry, ADD-S (Hodan et al. 2016) for objects with one;
-every summary names which. Poses are T_cam_obj, batches of N; distances in metres. A target without an
-estimate has an infinite error, so that it counts as failed.
+Errors: ADD (Hinterstoisser et al. 2012) for objects without symmetry and ADD-S (Hodan et al. 2016) for
+objects with one; MSSD and MSPD of the BOP challenge (Hodan et al. 2020), which take the symmetries one by
+one; rotation, translation and signed depth. Poses are T_cam_obj, batches of N; distances in metres. A target
+without an estimate has an infinite error, so that it counts as failed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from dataset import SE3
 from s2p3.objects import Symmetry
 
 Floats = NDArray[np.float64]
+
+SYMMETRY_STEPS = 315
+"""Turns about a continuous axis that MSSD and MSPD try: as many as the BOP challenge, ceil(pi / 0.01)."""
+
+MSSD_SHARES: Floats = np.arange(1, 11, dtype=np.float64) / 20
+"""Of the diameter: the thresholds of the BOP challenge's recall by MSSD."""
+
+MSPD_PIXELS: Floats = np.arange(5, 51, 5, dtype=np.float64)
+"""Of an image 640 pixels wide: the thresholds of the BOP challenge's recall by MSPD."""
+
+AUC_LIMIT_M = 0.1
+"""Where the area under the recall curve ends, as with YCB-Video (Xiang et al. 2018)."""
+
+_MSPD_WIDTH_PX = 640.0
+_SKETCH = 48  # points that bound an error from below before all are looked at
 
 
 def add(estimated: SE3, true: SE3, points: Floats) -> Floats:
@@ -30,6 +45,28 @@ def add_s(estimated: SE3, true: SE3, points: Floats) -> Floats:
     metres."""
     pairs = zip(_placed(estimated, points), _placed(true, points), strict=True)
     return np.array([cKDTree(found).query(wanted)[0].mean() for found, wanted in pairs], dtype=np.float64)
+
+
+def mssd(estimated: SE3, true: SE3, points: Floats, symmetries: Floats) -> Floats:
+    """(N,) maximum symmetry-aware surface distance, metres.
+
+    Args:
+        points: (P, 3), in the BOP challenge the mesh's vertices; the largest distance is always at a corner
+            of their convex hull.
+        symmetries: (M, 4, 4) with the identity, see `Symmetry.sampled`.
+    """
+    return _smallest_largest(estimated, true, points, symmetries, lambda placed: placed)
+
+
+def mspd(estimated: SE3, true: SE3, points: Floats, symmetries: Floats, K: Floats) -> Floats:
+    """(N,) maximum symmetry-aware projection distance, pixels, of a pinhole with K (3, 3); as `mssd`."""
+
+    def project(placed: Floats) -> Floats:
+        seen = placed @ K.T
+        projected: Floats = seen[..., :2] / seen[..., 2:]
+        return projected
+
+    return _smallest_largest(estimated, true, points, symmetries, project)
 
 
 def rotation_error_deg(estimated: SE3, true: SE3, symmetry: Symmetry) -> Floats:
@@ -48,41 +85,83 @@ def rotation_error_deg(estimated: SE3, true: SE3, symmetry: Symmetry) -> Floats:
     return np.degrees(angle.min(axis=1))
 
 
-def recall(errors: Floats, threshold: float) -> float:
+def viewing_direction(T_cam_obj: SE3) -> Floats:
+    """(N, 3) unit vectors of the object frame, from the object's origin to the camera."""
+    to_camera = T_cam_obj.inverse().translation
+    return to_camera / np.linalg.norm(to_camera, axis=-1, keepdims=True)
+
+
+def view_distance_deg(directions: Floats, known: Floats, symmetry: Symmetry) -> Floats:
+    """(N,) angle on the sphere of views from each of `directions` (N, 3) to the nearest of `known` (M, 3),
+    degrees; views that a symmetry makes alike count as the same."""
+    turned = np.concatenate([known, *(known @ turn[:3, :3].T for turn in symmetry.transforms)])
+    if symmetry.axis is None:
+        return np.degrees(np.arccos(np.clip(directions @ turned.T, -1, 1).max(axis=1)))
+    from_axis, known_from_axis = (np.arccos(np.clip(d @ symmetry.axis, -1, 1)) for d in (directions, turned))
+    nearest: Floats = np.abs(from_axis[:, None] - known_from_axis).min(axis=1)
+    return np.degrees(nearest)
+
+
+def recall(errors: ArrayLike, threshold: float) -> float:
     """Share of targets with an error below `threshold`, percent; NaN without targets."""
-    return float(100 * np.mean(errors < threshold)) if len(errors) else float("nan")
+    return float(recall_curve(errors, [threshold])[0])
 
 
-@dataclass(frozen=True)
-class Summary:
-    """What a list of targets comes to.
+def recall_curve(errors: ArrayLike, thresholds: ArrayLike) -> Floats:
+    """(T,) `recall` at each of the thresholds (T,)."""
+    errors = np.asarray(errors, dtype=np.float64)
+    if not len(errors):
+        return np.full(len(np.atleast_1d(thresholds)), np.nan)
+    percent: Floats = 100 * (errors[None] < np.asarray(thresholds)[:, None]).mean(axis=1)
+    return percent
 
-    Attributes:
-        metric: "ADD" or "ADD-S": what the recalls are of.
-        targets, missed: how many there were, and without any estimate.
-        recall_10, recall_5: percent of all targets within 10 % and 5 % of the diameter.
-        rotation_deg, translation_mm: medians over the targets with an estimate.
-        depth_mm: median signed error of z, positive where the estimate is too far.
-    """
 
-    metric: str
-    targets: int
-    missed: int
-    recall_10: float
-    recall_5: float
-    rotation_deg: float
-    translation_mm: float
-    depth_mm: float
+def area_shares(errors: ArrayLike, limit: float = AUC_LIMIT_M) -> Floats:
+    """(N,) what each target adds to the area under the recall curve up to `limit`, percent: the area is their
+    mean, and exact (no curve is sampled)."""
+    shares: Floats = 100 * np.clip(1 - np.asarray(errors, dtype=np.float64) / limit, 0, 1)
+    return shares
 
-    def __str__(self) -> str:
-        return (
-            f"{self.metric} recall at 10 % {self.recall_10:.1f}, at 5 % {self.recall_5:.1f} "
-            f"({self.targets} targets, {self.missed} missed); medians: rotation {self.rotation_deg:.1f} deg, "
-            f"translation {self.translation_mm:.1f} mm, depth {self.depth_mm:+.1f} mm"
-        )
+
+def average_recalls(errors: ArrayLike, thresholds: ArrayLike) -> Floats:
+    """(N,) percent of the thresholds that each error stays below; their mean is the BOP challenge's AR."""
+    percent: Floats = 100 * (np.asarray(errors)[:, None] < np.asarray(thresholds)[None]).mean(axis=1)
+    return percent
+
+
+def mspd_thresholds_px(width: int) -> Floats:
+    """(10,) the BOP challenge's thresholds of MSPD in an image `width` pixels wide."""
+    thresholds: Floats = MSPD_PIXELS * np.float64(width / _MSPD_WIDTH_PX)
+    return thresholds
 
 
 def _placed(poses: SE3, points: Floats) -> Floats:
     """(N, P, 3)."""
     placed: Floats = points @ np.swapaxes(poses.rotation, -1, -2) + poses.translation[:, None]
     return placed
+
+
+def _smallest_largest(
+    estimated: SE3, true: SE3, points: Floats, symmetries: Floats, seen: Callable[[Floats], Floats]
+) -> Floats:
+    """(N,) the smallest over the symmetries of the largest distance over the points.
+
+    The distance of some points bounds that of all from below, which spares most symmetries the rest.
+    """
+    sketch = points[:: -(-len(points) // _SKETCH)]
+    turns = SE3.from_matrix(symmetries)
+    found = np.empty(len(estimated.translation))
+    for index in range(len(found)):
+        alike = true[index] @ turns
+        pose = SE3.stack([estimated[index]])
+        bounds = np.linalg.norm(seen(_placed(alike, sketch)) - seen(_placed(pose, sketch)), axis=-1).max(
+            axis=1
+        )
+        whole, best = seen(_placed(pose, points))[0], np.inf
+        for turn in np.argsort(bounds):
+            if bounds[turn] >= best:
+                break
+            placed = seen(_placed(SE3.stack([alike[int(turn)]]), points))[0]
+            best = min(best, float(np.linalg.norm(placed - whole, axis=-1).max()))
+        found[index] = best
+    return found

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from dataset import SE3, Intrinsics
+from dataset.errors import ToolkitError
 from s2p3.config import DetectorConfig, ExperimentConfig
 from s2p3.inputs import View
 from s2p3.networks.detector import Detection, Detector, detect
@@ -68,7 +69,10 @@ class Estimator:
     @staticmethod
     def load(path: Path, object_name: str | None = None) -> Estimator:
         """Reads a teacher's or a student's checkpoint. Raises ToolkitError as `checkpoint.read_info`."""
-        if checkpoint.read_info(path).kind == "teacher":
+        kind = checkpoint.read_info(path).kind
+        if kind == "detector":
+            raise ToolkitError(f"{path}: holds a detector, not a teacher or student; give one of theirs")
+        if kind == "teacher":
             return Estimator(*load_teacher(path, object_name))
         return Estimator(*load_student(path, object_name))
 

@@ -20,9 +20,9 @@ from dataset import SE3
 from s2p3 import objects
 from s2p3.demo_report import TARGETS, compare
 from s2p3.evaluation import Evaluation
-from s2p3.evaluation.evaluate import Record, summarize
 from s2p3.lab import LabTruth
 from s2p3.lab.truth import sample_truth
+from tests.s2p3.evaluations import evaluation, missed, record
 
 
 def lab(name: str) -> LabTruth:
@@ -42,13 +42,11 @@ def recovered(truth: LabTruth) -> Calibration:
 
 def runs(name: str) -> dict[str, Evaluation]:
     """Before: one of four found; after: three of four; one is missed by both."""
-    pose = tuple(map(tuple, np.eye(4).tolist()))
-    missed = Record(3, 1.0, None, None, float("inf"), float("nan"), float("nan"), float("nan"))
     made = {}
     for run, found in (("teacher", 2), ("before", 1), ("after", 3)):
         errors = [1e-4] * found + [0.5] * (3 - found)
-        records = [Record(i, 1.0, (0, 0, 9, 9), pose, e, 1.0, 1.0, 1.0) for i, e in enumerate(errors)]
-        made[run] = Evaluation(summarize([*records, missed], objects.build(name)), (*records, missed))
+        records = [record(i, error) for i, error in enumerate(errors)]
+        made[run] = evaluation([*records, missed(3)], objects.build(name))
     return made
 
 

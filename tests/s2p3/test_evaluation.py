@@ -11,18 +11,17 @@ import numpy as np
 import pytest
 
 from calibration import html
-from dataset import SE3
 from dataset.errors import ToolkitError
 from dataset.session import Session, mask_box
 from s2p3 import config as presets
 from s2p3.evaluation import Estimator, Evaluation, Finder, evaluate, find_objects
-from s2p3.evaluation.evaluate import Record, summarize
 from s2p3.evaluation.report import chosen_records, evaluation_section
 from s2p3.networks.detector import Detection, Detector
 from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
 from s2p3.training.checkpoint import CheckpointInfo, Kind
 from s2p3.training.pretrain import build_student
+from tests.s2p3.evaluations import evaluation, record
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +54,12 @@ def test_every_target_is_counted(
         found[2] = found[5] = None
         result = evaluate(session, range(8), cup, *networks, found, silent)
     assert (result.summary.targets, result.summary.missed, result.summary.metric) == (8, 2, "ADD")
-    assert [np.isinf(record.error_m) for record in result.records] == [i in (2, 5) for i in range(8)]
+    assert np.isinf(result.errors_m).tolist() == [i in (2, 5) for i in range(8)]
     result.save(tmp_path / "evaluation.json")
+    assert str(Evaluation.load(tmp_path / "evaluation.json")) == str(result)  # NaN is not equal to itself
     stored = json.loads((tmp_path / "evaluation.json").read_text())
     assert stored["summary"]["targets"] == len(stored["records"]) == 8
-    assert stored["records"][2]["error_m"] is None
+    assert stored["records"][2]["add_m"] is None
 
 
 def test_the_truth_does_not_reach_the_networks(
@@ -91,21 +91,12 @@ def test_an_empty_split_is_said_clearly(
 
 
 def exact(session: Session, cup: ObjectModel, error: float) -> Evaluation:
-    poses = session.object_poses(cup.name).T_cam_obj
+    poses = session.object_poses(cup.name).T_cam_obj.as_matrix()
     records = [
-        Record(
-            index,
-            1.0,
-            (0.0, 0.0, 1.0, 1.0),
-            tuple(map(tuple, SE3(poses[index].rotation, poses[index].translation).as_matrix().tolist())),
-            error * (index + 1),
-            1.0,
-            1.0,
-            1.0,
-        )
+        record(index, error * (index + 1), T_cam_obj=tuple(map(tuple, poses[index].tolist())))
         for index in range(8)
     ]
-    return Evaluation(summarize(records, cup), tuple(records))
+    return evaluation(records, cup)
 
 
 def test_the_report_shows_truth_before_and_after(cup_session: Path, cup: ObjectModel) -> None:
@@ -119,9 +110,8 @@ def test_the_report_shows_truth_before_and_after(cup_session: Path, cup: ObjectM
         assert f">{name}</text>" in text
 
 
-def test_pictures_are_of_the_best_the_median_and_the_worst(cup_session: Path, cup: ObjectModel) -> None:
-    with Session.open(cup_session) as session:
-        records = exact(session, cup, 0.01).records
-    chosen = [(rank, record.frame) for rank, record in chosen_records(records, 6)]
-    assert chosen == [("best", 0), ("best", 1), ("median", 3), ("median", 4), ("worst", 6), ("worst", 7)]
-    assert len(chosen_records(records[:1], 6)) == 3
+def test_pictures_are_of_the_best_the_median_and_the_worst() -> None:
+    errors = np.append(0.01 * np.arange(1, 8), np.inf)
+    wanted = [("best", 0), ("best", 1), ("median", 3), ("median", 4), ("worst", 6), ("worst", 7)]
+    assert chosen_records(errors, 6) == wanted
+    assert len(chosen_records(errors[:1], 6)) == 3

@@ -1,0 +1,152 @@
+"""`s2p3 evaluate` writes figures, report and BOP results, compares runs, and refuses what it cannot judge."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+
+from dataset.session import write_split
+from s2p3.cli import main
+from s2p3.evaluation.bop_results import write_bop_results
+from s2p3.evaluation.summary import FIGURES
+from s2p3.objects import ObjectModel, build
+from tests.s2p3.evaluations import evaluation, missed, record
+from tests.s2p3.untrained import eager_detector_config, save_untrained
+
+Networks = dict[str, Path]
+
+
+@pytest.fixture(scope="module")
+def networks(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> Networks:
+    return save_untrained(tmp_path_factory.mktemp("networks"), cup, eager_detector_config())
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory, cup_session: Path) -> Path:
+    path = Path(shutil.copy(cup_session, tmp_path_factory.mktemp("session") / "cup.h5"))
+    write_split(path, "train", [0, 1, 2])
+    write_split(path, "test", [3, 4, 5, 6, 7])
+    return path
+
+
+def words(session: Path, networks: Networks, network: str = "student", name: str = "cup") -> list[str]:
+    chosen = ["--network", str(networks[network]), "--detector", str(networks["detector"])]
+    return ["evaluate", str(session), "--object", name, *chosen]
+
+
+def refusal(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> str:
+    """The one line with which the command line refuses."""
+    capfd.readouterr()
+    assert main(arguments) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    return line
+
+
+def test_an_evaluation_leaves_figures_report_and_results(
+    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "teacher.json", tmp_path / "student.json"
+    assert main([*words(session, networks, "teacher"), "--out", str(first)]) == 0
+    capfd.readouterr()
+    extra = ["--out", str(second), "--beside", str(first), "--scene-id", "3", "--json"]
+    assert main([*words(session, networks), *extra]) == 0
+    printed = json.loads(capfd.readouterr().out)
+    assert set(printed["intervals"]) == set(printed["above"]["teacher"]) == set(FIGURES)
+    content = json.loads(second.read_text())
+    assert content["subject"]["object_name"] == "cup"
+    assert len(content["records"]) == content["summary"]["targets"] == 5
+    assert all(record["unseen_deg"] >= 0 for record in content["records"])
+    assert "from the nearest known view" in content["groups"]
+    page = second.with_suffix(".html").read_text()
+    assert page.count("<img") == 6
+    for text in ("student minus", "AR MSSD", "from the nearest known view", "cup: teacher"):
+        assert text in page
+    rows = list(csv.DictReader(second.with_suffix(".csv").open()))
+    assert [int(row["im_id"]) for row in rows] == [3, 4, 5, 6, 7]
+    assert {(row["scene_id"], row["obj_id"]) for row in rows} == {("3", "1")}
+
+
+def test_results_hold_the_estimates_as_the_bop_toolkit_reads_them(cup: ObjectModel, tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[:3] = [[0, -1, 0, 0.001], [1, 0, 0, -0.02], [0, 0, 1, 0.4]]
+    found = record(7, 0.01, T_cam_obj=tuple(map(tuple, pose.tolist())))
+    path = tmp_path / "results.csv"
+    write_bop_results(path, evaluation([found, missed(8)], cup), scene_id=2, object_id=5)
+    header, row = path.read_text().splitlines()
+    assert header == "scene_id,im_id,obj_id,score,R,t,time"
+    assert row == "2,7,5,0.9,0.0 -1.0 0.0 1.0 0.0 0.0 0.0 0.0 1.0,1.0 -20.0 400.0,-1"
+
+
+def test_a_checkpoint_of_another_object_is_refused(
+    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    other = save_untrained(tmp_path, build("fork"), eager_detector_config())
+    for kind in ("student", "detector"):
+        line = refusal(words(session, networks | {kind: other[kind]}), capfd)
+        assert f"was trained for 'fork', not 'cup'; train a {kind}" in line
+
+
+def test_a_checkpoint_of_another_kind_is_refused(
+    session: Path, networks: Networks, capfd: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal(words(session, networks | {"detector": networks["student"]}), capfd)
+    assert "holds a student, not a detector" in line
+    line = refusal(words(session, networks, "detector"), capfd)
+    assert "holds a detector, not a teacher or student" in line
+
+
+def test_a_session_without_the_object_is_refused(
+    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    other = save_untrained(tmp_path, build("fork"), eager_detector_config())
+    assert "object 'fork' has no poses; run: s2p3 annotate" in refusal(
+        words(session, other, name="fork"), capfd
+    )
+
+
+def test_an_unknown_or_empty_split_is_refused(
+    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert "no split 'night'" in refusal([*words(session, networks), "--split", "night"], capfd)
+    empty = Path(shutil.copy(session, tmp_path / "empty.h5"))
+    with h5py.File(empty, "r+") as file:
+        file["poses/objects/cup/visible_fraction"][...] = 0.05
+    assert "none of the 5 frames shows 'cup'; choose another split" in refusal(words(empty, networks), capfd)
+
+
+def test_a_mesh_in_millimetres_is_refused(
+    session: Path, networks: Networks, cup: ObjectModel, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    mesh = tmp_path / "cup.ply"
+    trimesh.Trimesh(1000 * cup.vertices, cup.faces).export(mesh)
+    assert "probably in millimetres" in refusal([*words(session, networks), "--mesh", str(mesh)], capfd)
+
+
+def test_what_cannot_stand_beside_is_refused(
+    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "not.json").write_text("{}")
+    line = refusal([*words(session, networks), "--beside", str(tmp_path / "not.json")], capfd)
+    assert "is no saved evaluation" in line
+
+
+def test_nothing_detected_is_recall_zero_not_an_error(
+    session: Path, cup: ObjectModel, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = eager_detector_config()
+    never = replace(config.detector, minimum_score=1.0)
+    blind = save_untrained(tmp_path, cup, replace(config, detector=never))
+    capfd.readouterr()
+    assert main([*words(session, blind), "--out", str(tmp_path / "blind.json"), "--json"]) == 0
+    summary = json.loads(capfd.readouterr().out)
+    assert (summary["targets"], summary["missed"], summary["recall_10"]) == (5, 5, 0.0)
+    assert summary["rotation_deg"] is None
+    assert "missed" in (tmp_path / "blind.html").read_text()

@@ -37,7 +37,9 @@ def cup() -> MeshArrays:
     vertices, quads, caps = _lathe(profile, _CUP_SECTIONS)
     quads, (lower, upper) = _open_wall(quads, _CUP_SECTIONS, rows=(8, 22))
     vertices, handle = _handle(vertices, upper, lower)
-    return vertices, np.vstack([_split(quads), caps, _split(handle)]).astype(np.int32)
+    faces = np.vstack([_split(quads), caps, _split(handle)])
+    used, compact = np.unique(faces, return_inverse=True)  # the openings' inner vertices are gone
+    return vertices[used], compact.reshape(-1, 3).astype(np.int32)
 
 
 def bottle() -> MeshArrays:

@@ -63,7 +63,7 @@ def simplify(model: ObjectModel, largest_error_m: float) -> Simplified:
             faces=np.asarray(candidate.triangles, np.int32),
         )
         error = distance_between(model, fewer)
-        if error <= largest_error_m and candidate.is_watertight():
+        if error <= largest_error_m and candidate.is_edge_manifold(allow_boundary_edges=False):
             best, high = Simplified(fewer, error), count
         else:
             low = count
@@ -86,7 +86,8 @@ def _farthest(source: ObjectModel, target: ObjectModel) -> float:
         open3d.core.Tensor(target.vertices.astype(np.float32)),
         open3d.core.Tensor(target.faces.astype(np.uint32)),
     )
-    points = np.concatenate([source.vertices, source.surface_points(_SAMPLES)]).astype(np.float32)
+    corners = source.vertices[np.unique(source.faces)]
+    points = np.concatenate([corners, source.surface_points(_SAMPLES)]).astype(np.float32)
     distances: NDArray[np.float32] = scene.compute_distance(open3d.core.Tensor(points)).numpy()
     return float(distances.max())
 

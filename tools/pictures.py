@@ -1,7 +1,8 @@
 """Regenerates the pictures of the documentation from the toolkit itself: `python tools/pictures.py`.
 
 `lab.png`: the simulated lab's cup as its camera measures it, 8 bit and noisy, with the physical priors and
-the true normals beside it. `objects.png`: the four built-in objects as the analytic synthesis draws them.
+the true normals beside it. `objects.jpg` and `objects-path-traced.jpg`: the four built-in objects in the same
+scenes, drawn by either backend of the synthesis.
 """
 
 from __future__ import annotations
@@ -23,9 +24,8 @@ from s2p3.lab.rig import BOARD
 from s2p3.lab.scene import LabScene
 from s2p3.lab.truth import LabTruth, sample_truth
 from s2p3.rendering import rasterize
-from s2p3.synthesis import SYNTHETIC, draw_frame
-from s2p3.synthesis.generate import BITS, PAPER_CAMERA
-from s2p3.synthesis.scene import expose
+from s2p3.synthesis import SYNTHETIC, Analytic, Backend, PathTraced, Recipe, session_camera
+from s2p3.synthesis.frames import BITS
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 
@@ -36,6 +36,7 @@ _LAB_EYE_M = (0.17, 0.15, 0.20)
 """The camera in the cup's frame: a view that shows both handle and wall."""
 _EXPOSURE = 2.0
 """Fraction of the white level that a white, well-lit surface reaches."""
+_QUALITY = 88
 _FRAMES = {"cup": 8, "bottle": 5, "fork": 1, "knife": 4}
 """Which frame of a set with seed 0 shows each object."""
 
@@ -45,8 +46,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=IMAGES, help="folder for the pictures")
     out = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
-    for name, picture in (("lab.png", lab_picture()), ("objects.png", objects_picture())):
-        cv2.imwrite(str(out / name), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    made = {
+        "lab.png": lab_picture,
+        "objects.jpg": lambda: objects_picture(Analytic()),
+        "objects-path-traced.jpg": lambda: objects_picture(PathTraced.here()),
+    }
+    for name, picture in made.items():
+        cv2.imwrite(
+            str(out / name), picture(), [cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+        )
         print(f"{out / name}: {(out / name).stat().st_size // 1000} kB")
 
 
@@ -69,21 +77,42 @@ def lab_picture() -> Picture:
     return np.vstack([line_of_text(list(tiles)), side_by_side(row)])
 
 
-def objects_picture() -> Picture:
-    """An object a row: intensity, DoLP, AoLP and true normals of one frame of a training set."""
+def objects_picture(backend: Backend) -> Picture:
+    """An object a row, one frame of a training set: all of it, then intensity, DoLP, AoLP, the diffuse prior,
+    the nearest of the specular ones and the true normals around the object."""
     rows, titles = [], []
+    camera = session_camera()
     for name, index in _FRAMES.items():
         model = objects.build(name)
-        _, parameters, image, rng = draw_frame(model, PAPER_CAMERA, SYNTHETIC, 0, index)
-        stokes = decode(expose(image.stokes, parameters, BITS, rng), "mono", BITS)
+        recipe = Recipe(model, camera, SYNTHETIC, backend, 0)
+        image, raw = recipe.render(recipe.draw(index))
+        stokes = decode(raw, "mono", BITS)
         normals = np.zeros((*stokes.shape, 3), np.float32)
         normals[image.raster.window] = image.raster.normals
-        tiles = {**polarization_tiles(stokes), "true normals": pictures.normals(normals, image.mask)}
-        rows.append([tile(picture, image.mask) for picture in tiles.values()])
-        titles = list(tiles)
+        diffuse, *specular = pictures.prior_normals(stokes, camera.K.copy(), model.refractive_index)
+        tiles = {
+            **polarization_tiles(stokes),
+            "prior, diffuse": pictures.normals(diffuse, image.mask),
+            "prior, specular": pictures.normals(nearest(specular, normals), image.mask),
+            "true normals": pictures.normals(normals, image.mask),
+        }
+        whole = np.dstack([pictures.intensity(stokes)] * 3)
+        side = min(whole.shape[:2])
+        left = min(max(int(np.nonzero(image.mask)[1].mean()) - side // 2, 0), whole.shape[1] - side)
+        scene = cv2.resize(whole[:side, left : left + side], (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
+        rows.append([np.asarray(scene, np.uint8), *(tile(picture, image.mask) for picture in tiles.values())])
+        titles = ["scene", *tiles]
     gap = np.full((_GAP, len(titles) * (_SIDE + _GAP) - _GAP, 3), _PAPER, np.uint8)
     drawn = [strip for row in rows for strip in (side_by_side(row), gap)]
     return np.vstack([line_of_text(titles), *drawn[:-1]])
+
+
+def nearest(candidates: Sequence[NDArray[np.float32]], true: NDArray[np.float32]) -> NDArray[np.float32]:
+    """At each pixel the candidate normal, in either of its azimuths, that is nearest to the true one."""
+    turned = [*candidates, *(candidate * np.float32([-1, -1, 1]) for candidate in candidates)]
+    cosine = np.stack([(candidate * true).sum(axis=-1) for candidate in turned])
+    chosen = np.argmax(cosine, axis=0)
+    return np.take_along_axis(np.stack(turned), chosen[None, ..., None], axis=0)[0]
 
 
 def measured(truth: LabTruth, T_base_cam: SE3) -> tuple[Stokes, Intrinsics]:

@@ -18,14 +18,25 @@ from s2p3.synthesis.scene import Clutter, SceneParameters
 
 Image = NDArray[np.float32]
 
+_OCCLUDER = (0.08, 0.5)  # size, in diameters of the object
 _DARK = 0.03
 """Bodies that return less light than this are prevailingly specular: a plastic reflects 4 % at least."""
 
 
 def draw_scene(
-    domain: Domain, model: ObjectModel, T_cam_obj: SE3, rng: np.random.Generator
+    domain: Domain,
+    model: ObjectModel,
+    T_cam_obj: SE3,
+    rng: np.random.Generator,
+    occluded: bool | None = None,
 ) -> SceneParameters:
-    """Everything else about a scene with the object seen at T_cam_obj."""
+    """Everything else about a scene with the object seen at T_cam_obj.
+
+    Args:
+        occluded: whether something stands between camera and object; by the domain's share when None.
+    """
+    if occluded is None:
+        occluded = rng.random() < domain.occluder_share
     specular = model.material == "metal" or rng.random() < domain.specular_share
     if model.albedo is not None:
         specular = model.albedo < _DARK
@@ -42,7 +53,7 @@ def draw_scene(
         wall=_smooth(rng, (3, 24), 256, 0.03, 0.9),
         haze_dolp=_smooth(rng, (patches,), patches, 0.0, rng.uniform(*domain.haze_dolp)),
         haze_angle=_smooth(rng, (3,), 3, 0.0, np.pi),
-        clutter=_clutter(domain, model, T_cam_obj, rng),
+        clutter=_clutter(domain, model, T_cam_obj, occluded, rng),
         dolp_scale=rng.uniform(*domain.dolp_scale),
         blur_px=rng.uniform(*domain.blur_px),
         level=rng.uniform(*domain.level),
@@ -121,7 +132,7 @@ def _smooth(rng: np.random.Generator, cells: tuple[int, ...], size: int, low: fl
 
 
 def _clutter(
-    domain: Domain, model: ObjectModel, T_cam_obj: SE3, rng: np.random.Generator
+    domain: Domain, model: ObjectModel, T_cam_obj: SE3, occluded: bool, rng: np.random.Generator
 ) -> tuple[Clutter, ...]:
     footprint = float(np.linalg.norm(model.vertices[:, :2], axis=1).max())
     items = []
@@ -133,8 +144,9 @@ def _clutter(
         items.append(
             Clutter(mesh, SE3.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)], place), _item_surface(rng))
         )
-    if rng.random() < domain.occluder_share:
-        mesh, _, _ = _item(0.2 * model.diameter, 0.55 * model.diameter, rng)
+    if occluded:
+        size = model.diameter * np.exp(rng.uniform(*np.log(_OCCLUDER)))
+        mesh, _, _ = _item(0.6 * size, size, rng)
         target = model.vertices[rng.integers(len(model.vertices))]
         eye = T_cam_obj.inverse().translation
         between = model.resting.apply(target + rng.uniform(0.25, 0.55) * (eye - target))

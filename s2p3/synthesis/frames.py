@@ -27,7 +27,7 @@ BITS = 12
 MEASURED = 64
 """Images of a set whose informativeness is measured: the first so many."""
 
-_ATTEMPTS = 30  # drawings of one scene until the object is visible enough
+_ATTEMPTS = 60  # drawings of one scene until the object is visible enough
 _SMALLEST_PX = 60  # visible pixels of an object worth training on
 
 PAPER_CAMERA = Intrinsics(
@@ -89,9 +89,12 @@ class Recipe:
         """
         rng = np.random.default_rng([self.seed, index])
         paths = int(np.random.default_rng([self.seed, index, 1]).integers(2**31))
+        occluded = bool(
+            rng.random() < self.domain.occluder_share
+        )  # once, or attempts would favour clear views
         for _ in range(_ATTEMPTS):
             T_cam_obj = self.domain.views.draw(self.model, self.intrinsics, rng)
-            parameters = draw_scene(self.domain, self.model, T_cam_obj, rng)
+            parameters = draw_scene(self.domain, self.model, T_cam_obj, rng, occluded)
             scene = Scene(self.model, T_cam_obj, self.intrinsics, parameters)
             enough = scene.visible_fraction >= self.domain.smallest_visible_fraction
             if enough and scene.mask.sum() >= _SMALLEST_PX:

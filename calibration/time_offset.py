@@ -26,6 +26,9 @@ MIN_FRAMES = 8
 _SCAN_STEP_S = 0.01
 _SLOPE_SPAN_S = 0.02  # the arm's noise from one sample to the next must not pass for speed
 _MAX_SIGMA_S = 2e-3
+_EXACT = 1e-7
+"""Radians and metres: no hand-eye transform is known better, also one that comes without uncertainty."""
+
 _MIN_SPEED_PX_S = 30.0  # an arm at rest seems to move at a few px/s, by its own noise
 _FAR = 1e3  # px: a corner behind the camera, or without an arm pose
 
@@ -167,7 +170,7 @@ def _refined(
     ).at_offset(offset)
     free = state.free(offset=True)
     information = np.zeros((len(free), len(free)))
-    information[TRANSFORMS, TRANSFORMS] = np.linalg.inv(covariance)
+    information[TRANSFORMS, TRANSFORMS] = np.linalg.inv(covariance + _EXACT**2 * np.eye(len(covariance)))
     found = fit(replace(state, expected=state), problem.observations.of_views(used), free, information)
     place = int(np.count_nonzero(free[:SCALE]))  # after the transforms: the scale is not free
     return found.state.offset_s, float(np.sqrt(found.solution.covariance[place, place]))

@@ -31,10 +31,15 @@ class FrameAccount:
 
 def account(session: Session) -> FrameAccount:
     """Counts the frames of a recording by their ids: gaps against the ledger and the pauses."""
-    ids, dropped, pauses = session.frame_ids, session.drops["frame_id"], session.pauses
-    silent = int(np.maximum(unexplained(ids, dropped, pauses), 0).sum())
-    paused = int((pauses["last_id"] - pauses["first_id"] + 1).sum())
-    return FrameAccount(len(ids) + len(dropped) + silent, len(ids), len(dropped), paused, silent)
+    ids, dropped = session.frame_ids, session.drops["frame_id"]
+    silent = int(np.maximum(unexplained(ids, dropped, session.pauses), 0).sum())
+    return FrameAccount(len(ids) + len(dropped) + silent, len(ids), len(dropped), paused(session), silent)
+
+
+def paused(session: Session) -> int:
+    """How many frames were taken while the recording was paused."""
+    pauses = session.pauses
+    return int((pauses["last_id"] - pauses["first_id"] + 1).sum())
 
 
 def unexplained(

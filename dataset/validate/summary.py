@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataset.frames import CameraInfo
-from dataset.session.accounting import account
+from dataset.session.accounting import paused
 from dataset.session.reader import Session
 
 
@@ -85,7 +85,7 @@ def info(path: str | Path) -> SessionInfo:
             camera=session.camera,
             frames=frames,
             drops=contents.length("camera/drops"),
-            paused=account(session).paused,
+            paused=paused(session),
             segments=max(1, len(session.segments)),
             duration_s=(ends[-1] - ends[0]) * 1e-9,
             robot_samples=contents.length("robot/host_time_ns"),

@@ -12,6 +12,9 @@ from dataset.errors import ToolkitError
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(optional)")]
 """A file that need not be given."""
 
+OptionalNumber = Annotated[float | None, tyro.conf.arg(metavar="NUMBER", help_behavior_hint="(optional)")]
+"""A number that need not be given."""
+
 ObjectName = Annotated[str, tyro.conf.arg(metavar="NAME")]
 """Of a built-in object, or of the one in --mesh."""
 

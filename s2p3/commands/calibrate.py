@@ -175,7 +175,7 @@ def polarizer(
     extinction_ratio: float = float("inf"),
     apply: tuple[Path, ...] = (),
 ) -> None:
-    """Estimate gain, extinction and orientation of every pixel's polarizer, from turning one before the lens.
+    """Estimate gain, extinction and orientation of each pixel's polarizer, by turning one before the lens.
 
     Args:
         session: recorded with s2p3 capture polarizer.

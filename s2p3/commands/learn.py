@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from s2p3.commands.arguments import ObjectName, OptionalPath, Sessions, at_least
+from s2p3.commands.arguments import ObjectName, OptionalNumber, OptionalPath, Sessions, at_least
 from s2p3.commands.output import counting, say
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def synthesize(
     out: Path,
     mesh: OptionalPath = None,
     material: OptionalPath = None,
-    simplify_mm: float | None = None,
+    simplify_mm: OptionalNumber = None,
     intrinsics: OptionalPath = None,
     views_like: OptionalPath = None,
     domain: Literal["synthetic", "captured"] = "synthetic",

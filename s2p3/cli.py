@@ -81,6 +81,8 @@ VERBS: dict[str, Verb | Group] = {
         },
     ),
     "evaluate": use.evaluate,
+    "predict": use.predict,
+    "export": use.export,
 }
 
 _DESCRIPTION = (

@@ -43,12 +43,8 @@ def import_raw_folder(
         SessionError: the session exists.
     """
     folder = Path(folder)
-    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in _SUFFIXES)
-    if not files:
-        raise ToolkitError(
-            f"{folder} holds no {', '.join(_SUFFIXES)} file; name the folder of the raw mosaics"
-        )
-    first = _read(files[0])
+    files = mosaic_files(folder)
+    first = read_mosaic(files[0])
     if bits is None and first.dtype == np.uint16:
         raise ToolkitError(f"{files[0]} has 16 bits, of which 10, 12 or all may count; give --bits")
     depth = bits or 8
@@ -57,7 +53,7 @@ def import_raw_folder(
 
     def mosaics() -> Iterator[Raw]:
         for path in files:
-            pixels = _read(path)
+            pixels = read_mosaic(path)
             if pixels.shape != first.shape or pixels.dtype != first.dtype:
                 raise ToolkitError(
                     f"{path} is {pixels.shape} {pixels.dtype}, {files[0].name} is {first.shape} "
@@ -77,7 +73,18 @@ def import_raw_folder(
     return write_imported(out, imported, mosaics())
 
 
-def _read(path: Path) -> Raw:
+def mosaic_files(folder: Path) -> list[Path]:
+    """The PNG, TIFF and npy files of a folder, by name. Raises ToolkitError: there are none."""
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in _SUFFIXES)
+    if not files:
+        raise ToolkitError(
+            f"{folder} holds no {', '.join(_SUFFIXES)} file; name the folder of the raw mosaics"
+        )
+    return files
+
+
+def read_mosaic(path: Path) -> Raw:
+    """The raw mosaic in a PNG, TIFF or npy file, (H, W). Raises ToolkitError: it is none."""
     if path.suffix.lower() == ".npy":
         try:
             image = np.load(path, allow_pickle=False)

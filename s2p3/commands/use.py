@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -70,3 +70,71 @@ def evaluate(
     for name, found in against.items():
         low, high = found["recall_10"].interval
         print(f"recall_10 above {name}  {found['recall_10'].value:+.1f} [{low:+.1f}, {high:+.1f}]")
+
+
+def predict(
+    source: tyro.conf.Positional[Path],
+    *,
+    object: ObjectName,
+    network: Network,
+    detector: Network,
+    mesh: OptionalPath = None,
+    calibration: OptionalPath = None,
+    split: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(optional)")] = None,
+    count: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")] = None,
+    mosaic: Literal["mono", "colour"] = "colour",
+    bits: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")] = None,
+    out: OptionalPath = None,
+) -> None:
+    """Estimate the object's pose in recorded or live frames; one JSON line for every frame on stdout.
+
+    A line holds the frame, whether the object was found, its pose T_cam_obj and, where the camera's place is
+    known, T_base_obj (4x4, metres), the detection's score and box, and the milliseconds it took.
+
+    Args:
+        source: a session (.h5), a rig.toml for its live camera, or a folder of raw mosaics.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
+        network: checkpoint of a teacher or student, or its ONNX file, which is quicker.
+        detector: checkpoint of the detector, or its ONNX file.
+        mesh: PLY, OBJ or STL of the object, metres.
+        calibration: calibration.json, for a folder and a live camera.
+        split: of a session, the split to predict on; all frames by default.
+        count: frames at most; a live camera goes on until Ctrl-C by default.
+        mosaic: of a folder, mono for cells of 2x2 pixels, colour for super-pixels of 4x4.
+        bits: of a folder, significant bits of a value; needed for 16-bit files.
+        out: folder for poses.jsonl and an overlay of every frame.
+    """
+    import json
+
+    from s2p3.evaluation import Estimator, Finder
+    from s2p3.evaluation.predictions import opened_source, predictions, saved
+    from s2p3.objects import named_object
+
+    at_least(1, **({} if count is None else {"count": count}), **({} if bits is None else {"bits": bits}))
+    model = named_object(object, mesh)
+    find, estimate = Finder.load(detector, model.name), Estimator.load(network, model.name)
+    with opened_source(source, calibration, split, count, mosaic, bits) as shots:
+        found = predictions(shots, find, estimate)
+        for prediction in found if out is None else saved(found, model, out):
+            print(json.dumps(prediction.to_json()), flush=True)
+
+
+def export(
+    checkpoint: tyro.conf.Positional[Path],
+    *,
+    out: OptionalPath = None,
+    image_size: tuple[int, int] = (612, 512),
+) -> None:
+    """Export a teacher, student or detector to ONNX, and check that it gives what the checkpoint gives.
+
+    Args:
+        checkpoint: NAME.safetensors.
+        out: NAME.onnx; beside the checkpoint by default.
+        image_size: width and height of the polarization image, which a detector's file is made for.
+    """
+    from s2p3.evaluation.export import export as write
+
+    at_least(32, image_size=min(image_size))
+    path = checkpoint.with_suffix(".onnx") if out is None else out
+    worst = write(checkpoint, path, image_size)
+    say(f"{path}: differs from {checkpoint} by at most {worst:.1e} of the largest output")

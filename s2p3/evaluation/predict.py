@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from dataset import SE3, Intrinsics
 from dataset.errors import ToolkitError
 from s2p3.config import DetectorConfig, ExperimentConfig
 from s2p3.inputs import View
-from s2p3.networks.detector import Detection, Detector, detect
+from s2p3.networks.detector import Detection, DetectorNetwork, detect
+from s2p3.networks.onnx_files import OnnxNetwork
 from s2p3.networks.pose_head import decode_pose
-from s2p3.networks.student import Student
-from s2p3.networks.teacher import Teacher, TeacherOutput
+from s2p3.networks.teacher import TeacherOutput
 from s2p3.training import checkpoint
 from s2p3.training.batches import form_input
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import single_crop
 from s2p3.training.detection import load_detector
 from s2p3.training.pretrain import load_student, load_teacher
+
+PoseNetwork = Callable[[Tensor, Tensor], Tensor | TeacherOutput]
+"""A teacher or student: polarization and priors to the head's nine numbers, or to all a teacher predicts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +50,15 @@ class PoseEstimate:
 class Finder:
     """A trained detector with its settings: Stokes image to `Detection`."""
 
-    network: Detector
+    network: DetectorNetwork
     settings: DetectorConfig
 
     @staticmethod
     def load(path: Path, object_name: str | None = None) -> Finder:
-        """Reads a checkpoint. Raises ToolkitError as `checkpoint.read_info`."""
+        """Reads a checkpoint, or the ONNX file of one. Raises ToolkitError as `checkpoint.read_info`."""
+        if path.suffix == ".onnx":
+            info = checkpoint.read_info(path, "detector", object_name)
+            return Finder(cast(DetectorNetwork, _exported(path)), info.config.detector)
         network, info = load_detector(path, object_name)
         return Finder(network, info.config.detector)
 
@@ -63,18 +72,22 @@ class Finder:
 class Estimator:
     """A trained teacher or student: Stokes image and detection to pose."""
 
-    network: Teacher | Student
+    network: PoseNetwork
     info: CheckpointInfo
 
     @staticmethod
     def load(path: Path, object_name: str | None = None) -> Estimator:
-        """Reads a teacher's or a student's checkpoint. Raises ToolkitError as `checkpoint.read_info`."""
-        kind = checkpoint.read_info(path).kind
-        if kind == "detector":
+        """Reads a teacher's or a student's checkpoint, or the ONNX file of one.
+
+        Raises ToolkitError as `checkpoint.read_info`.
+        """
+        info = checkpoint.read_info(path, None, object_name)
+        if info.kind == "detector":
             raise ToolkitError(f"{path}: holds a detector, not a teacher or student; give one of theirs")
-        if kind == "teacher":
-            return Estimator(*load_teacher(path, object_name))
-        return Estimator(*load_student(path, object_name))
+        if path.suffix == ".onnx":
+            return Estimator(cast(PoseNetwork, _exported(path)), info)
+        load = load_teacher if info.kind == "teacher" else load_student
+        return Estimator(*load(path, object_name))
 
     @torch.no_grad()
     def __call__(
@@ -95,3 +108,12 @@ class Estimator:
         rotation, translation, _ = decode_pose(pose, seen.K, seen.size, self.info.diameter_m)
         T_cam_obj = SE3(rotation[0].double().numpy(), translation[0].double().numpy())
         return PoseEstimate(T_cam_obj, detection.score, detection)
+
+
+def _exported(path: Path) -> OnnxNetwork:
+    """The network in an ONNX file. Raises ToolkitError: it is not of the description beside it."""
+    network = OnnxNetwork.load(path)
+    description = path.with_suffix(".json")
+    if network.description != description.read_text(encoding="utf-8"):
+        raise ToolkitError(f"{path}: was not exported from what {description} describes; export it again")
+    return network

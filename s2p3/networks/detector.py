@@ -8,6 +8,7 @@ votes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -90,9 +91,13 @@ def detector_input(stokes: Tensor) -> Tensor:
     return padded.contiguous(memory_format=torch.channels_last)
 
 
+DetectorNetwork = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""A `Detector`, or what takes and gives the same."""
+
+
 @torch.no_grad()
 def detect(
-    network: Detector,
+    network: DetectorNetwork,
     stokes: NDArray[np.float32],
     level: int,
     threshold: float,

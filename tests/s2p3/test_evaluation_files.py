@@ -8,12 +8,11 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import trimesh
 
-from dataset.session import write_split
+from dataset.session import ObjectPoses, Session, write_poses, write_split
 from s2p3.cli import main
 from s2p3.evaluation.bop_results import write_bop_results
 from s2p3.evaluation.summary import FIGURES
@@ -117,8 +116,11 @@ def test_an_unknown_or_empty_split_is_refused(
 ) -> None:
     assert "no split 'night'" in refusal([*words(session, networks), "--split", "night"], capfd)
     empty = Path(shutil.copy(session, tmp_path / "empty.h5"))
-    with h5py.File(empty, "r+") as file:
-        file["poses/objects/cup/visible_fraction"][...] = 0.05
+    with Session.open(empty) as opened:
+        poses = opened.object_poses("cup")
+        masks = np.stack([poses.mask(index) for index in range(len(opened))])
+    hidden = ObjectPoses(poses.T_cam_obj, 0.05 * poses.visible_fraction, poses.bbox_xywh, masks)
+    write_poses(empty, poses.T_cam_obj.inverse(), 0.0, 0.0, {"cup": hidden})
     assert "none of the 5 frames shows 'cup'; choose another split" in refusal(words(empty, networks), capfd)
 
 

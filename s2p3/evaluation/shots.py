@@ -1,0 +1,117 @@
+"""Where the images to predict on come from: a session, a folder of raw frames, the live camera of a rig.
+
+No pose, mask or box of a session is read, only images, intrinsics and the camera's place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acquisition.rig import Rig, open_camera, open_pose_source
+from calibration import Calibration
+from dataset import SE3, CameraInfo, Intrinsics
+from dataset.errors import ToolkitError
+from dataset.frames import SUPERPIXEL, Mosaic
+from dataset.importers.raw_folder import mosaic_files, read_mosaic
+from dataset.on_camera import decode_frame
+from dataset.polarimetry import Raw, remap
+from dataset.session import Session
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One undistorted polarization image.
+
+    Attributes:
+        name: frame index, file name, or the camera's frame id.
+        stokes: (3, H, W).
+        intrinsics: of that image, a pinhole.
+        T_base_cam: the camera in the robot's base frame; None where unknown.
+        host_time_ns: when it arrived; 0 where unknown.
+    """
+
+    name: str
+    stokes: NDArray[np.float32]
+    intrinsics: Intrinsics
+    T_base_cam: SE3 | None
+    host_time_ns: int
+
+
+def session_shots(session: Session, indices: Sequence[int]) -> Iterator[Shot]:
+    """Frames of an open, calibrated session."""
+    poses, times = session.poses, session.host_time_ns
+    for index in indices:
+        known = poses is not None and bool(poses.finite[index])
+        place = poses[index] if poses is not None and known else None
+        stokes = session.stokes(index).stack()
+        yield Shot(str(index), stokes, session.working_intrinsics, place, int(times[index]))
+
+
+def folder_shots(folder: Path, mosaic: Mosaic, bits: int | None, calibration: Calibration) -> Iterator[Shot]:
+    """The raw mosaics of a folder, by name.
+
+    Args:
+        bits: significant bits of a value; must be given for 16-bit files.
+
+    Raises ToolkitError: no such files, unknown bits, another size than the calibrated one.
+    """
+    files = mosaic_files(folder)
+    first = read_mosaic(files[0])
+    if bits is None and first.dtype == np.uint16:
+        raise ToolkitError(f"{files[0]} has 16 bits, of which 10, 12 or all may count; give --bits")
+    depth, (height, width) = bits or 8, first.shape
+    camera = CameraInfo("", "", "", "", f"Mono{depth}", mosaic, width, height, depth, 0)
+    decoder = _Decoder(camera, calibration, str(files[0]))
+    for path in files:
+        yield decoder.shot(path.name, read_mosaic(path), None, 0)
+
+
+def live_shots(rig: Rig, calibration: Calibration, count: int | None) -> Iterator[Shot]:
+    """The rig's camera, triggered frame by frame, until `count` or for ever; the arm is only read.
+
+    The camera's place is the arm's after the exposure, so it holds while the arm stands.
+
+    Raises ToolkitError: a device does not answer; the calibration is of another image size.
+    """
+    with ExitStack() as stack:
+        camera = stack.enter_context(open_camera(rig))
+        arm = None if calibration.hand_eye is None else stack.enter_context(open_pose_source(rig))
+        decoder = _Decoder(camera.info, calibration, "the camera")
+        camera.start("software")
+        taken = 0
+        while count is None or taken < count:
+            camera.trigger()
+            frame = camera.read()
+            place = None
+            if arm is not None and calibration.hand_eye is not None:
+                place = arm.sample().T_base_tcp @ calibration.hand_eye.T_tcp_cam
+            yield decoder.shot(str(frame.frame_id), frame.pixels, place, frame.host_time_ns)
+            taken += 1
+
+
+class _Decoder:
+    """Raw mosaics of one camera to shots."""
+
+    def __init__(self, camera: CameraInfo, calibration: Calibration, where: str) -> None:
+        calibration.require("intrinsics")
+        assert calibration.intrinsics is not None
+        found = calibration.intrinsics.intrinsics
+        if (found.height, found.width) != (camera.height, camera.width):
+            raise ToolkitError(
+                f"{where} gives {camera.width}x{camera.height} pixels, the calibration is of "
+                f"{found.width}x{found.height}; calibrate this camera, or give its calibration.json"
+            )
+        working = found.at(SUPERPIXEL[camera.mosaic])
+        self._camera = camera
+        self._response = calibration.polarizer_response
+        self._maps, self._pinhole = working.undistort_map(), working.pinhole
+
+    def shot(self, name: str, raw: Raw, place: SE3 | None, host_time_ns: int) -> Shot:
+        stokes = remap(decode_frame(raw, self._camera, self._response), *self._maps)
+        return Shot(name, stokes.stack(), self._pinhole, place, host_time_ns)

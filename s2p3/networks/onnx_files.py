@@ -45,7 +45,7 @@ class OnnxNetwork:
     def load(path: Path) -> OnnxNetwork:
         """Reads a file. Raises ToolkitError: missing, unreadable or foreign, or no ONNX Runtime."""
         try:
-            import onnxruntime
+            import onnxruntime  # type: ignore[import-untyped]
         except ImportError as error:
             raise ToolkitError(f"{path} needs ONNX Runtime, which is missing; {_INSTALL}") from error
         if not path.is_file():

@@ -29,7 +29,7 @@ from s2p3.training.pretrain import build_student, build_teacher
 PAPER_MS = {"priors": 13.0, "detector": 15.4}
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def measure(rounds: int) -> dict[str, float]:
     """Median milliseconds, batch 1, 256x256; priors and detector of a 612x512 image."""
     torch.set_num_threads(1)
@@ -43,9 +43,9 @@ def measure(rounds: int) -> dict[str, float]:
     detector = channels_last(Detector(imagenet=False)).eval()
     stokes = torch.rand(1, 3, height, width) * torch.tensor([1.0, 0.2, 0.2]).view(1, 3, 1, 1)
     K = torch.tensor([[[800.0, 0, width / 2], [0, 800.0, height / 2], [0, 0, 1]]])
-    with tempfile.TemporaryDirectory() as folder, torch.inference_mode(False):
+    with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "student.onnx"
-        write_onnx(student, [image.clone() for image in seen], path, "bench")
+        write_onnx(student, seen, path, "bench")
         exported = OnnxNetwork.load(path)
     found = in_turns(
         {

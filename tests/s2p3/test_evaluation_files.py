@@ -102,6 +102,17 @@ def test_a_checkpoint_of_another_kind_is_refused(
     assert "holds a detector, not a teacher or student" in line
 
 
+def test_a_checkpoint_of_another_input_set_is_refused(
+    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    moved = Path(shutil.copy(networks["student"], tmp_path / "student.safetensors"))
+    text = networks["student"].with_suffix(".json").read_text()
+    assert "double_angle" in text
+    moved.with_suffix(".json").write_text(text.replace("double_angle", "angle"))
+    line = refusal(words(session, networks | {"student": moved}), capfd)
+    assert "student.safetensors: does not fit this network" in line
+
+
 def test_a_session_without_the_object_is_refused(
     session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -88,9 +88,6 @@ def predict(
 ) -> None:
     """Estimate the object's pose in recorded or live frames; one JSON line for every frame on stdout.
 
-    A line holds the frame, whether the object was found, its pose T_cam_obj and, where the camera's place is
-    known, T_base_obj (4x4, metres), the detection's score and box, and the milliseconds it took.
-
     Args:
         source: a session (.h5), a rig.toml for its live camera, or a folder of raw mosaics.
         object: cup, fork, knife, bottle, or the name of the object in --mesh.
@@ -102,7 +99,7 @@ def predict(
         count: frames at most; a live camera goes on until Ctrl-C by default.
         mosaic: of a folder, mono for cells of 2x2 pixels, colour for super-pixels of 4x4.
         bits: of a folder, significant bits of a value; needed for 16-bit files.
-        out: folder for poses.jsonl and an overlay of every frame.
+        out: folder for the same lines, poses.jsonl, and an overlay of every frame.
     """
     import json
 

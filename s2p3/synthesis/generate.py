@@ -25,7 +25,7 @@ from s2p3.synthesis.domain import SYNTHETIC, Domain
 from s2p3.synthesis.executors import Executor, rendered
 from s2p3.synthesis.frames import BITS, Part, Recipe
 from s2p3.synthesis.informativeness import Informativeness
-from s2p3.synthesis.manifest import manifest_path, request_of
+from s2p3.synthesis.manifest import request_of, write_manifest
 from s2p3.synthesis.scene import Backend
 
 
@@ -149,12 +149,7 @@ def _assemble(recipe: Recipe, folder: Path, count: int, out: Path) -> Informativ
     truth = ObjectPoses(SE3.stack(poses), np.array(visible), np.array(boxes), _Masks(masks, shape))
     write_poses(unfinished, SE3.identity((count,)), 0.0, 0.0, {recipe.model.name: truth})
     result = Informativeness.mean(figures)
-    manifest = {
-        "request": request_of(recipe),
-        "informativeness": json.loads(result.to_json()),
-        "frames": entries,
-    }
-    manifest_path(out).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    write_manifest(out, recipe, result, entries)
     result.draw(out.with_suffix(".informativeness.png"), f"{recipe.model.name}, {backend}, {count} frames")
     unfinished.rename(out)
     return result

@@ -21,6 +21,7 @@ from s2p3.objects import ObjectModel, Symmetry
 from s2p3.synthesis.analytic_scene import Analytic
 from s2p3.synthesis.domain import Domain
 from s2p3.synthesis.frames import Recipe, manifest_of
+from s2p3.synthesis.informativeness import Informativeness
 from s2p3.synthesis.mitsuba_engine import Engine, find_engine
 from s2p3.synthesis.path_traced import PathTraced
 from s2p3.synthesis.scene import Backend, SceneImage
@@ -55,6 +56,19 @@ def request_of(recipe: Recipe) -> dict[str, Any]:
         "backend": recipe.backend.describe(),
         "seed": recipe.seed,
     }
+
+
+def write_manifest(
+    session: str | Path, recipe: Recipe, figures: Informativeness, frames: list[dict[str, Any]]
+) -> None:
+    """Writes the manifest of a session, a line a frame."""
+    head = {
+        "request": json.dumps(request_of(recipe)),
+        "informativeness": figures.to_json(),
+        "frames": "[\n" + ",\n".join(map(json.dumps, frames)) + "\n]",
+    }
+    text = ",\n".join(f'"{name}": {value}' for name, value in head.items())
+    manifest_path(session).write_text(f"{{\n{text}\n}}\n", encoding="utf-8")
 
 
 def recipe_of(session: str | Path) -> tuple[Recipe, list[dict[str, Any]]]:

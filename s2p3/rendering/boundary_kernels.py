@@ -57,9 +57,15 @@ def backward_boundaries(
                     here = depth[b, 0, i, j] if face[b, i, j] >= 0 else np.inf
                     there = depth[b, 0, i1, j1] if face[b, i1, j1] >= 0 else np.inf
                     if max(here, there) <= min(here, there) * (1 + step):
-                        ends = table[face[b, i, j]], table[face[b, i1, j1]]
-                        found = _crease(R[b], t[b], K[b], *ends, normals[b], depth[b, 0], i, j, axis, step)
-                        at, z, nx, ny, nz = found
+                        cosine = normals[b, 0, i, j] * normals[b, 0, i1, j1]
+                        cosine += normals[b, 1, i, j] * normals[b, 1, i1, j1]
+                        cosine += normals[b, 2, i, j] * normals[b, 2, i1, j1]
+                        if cosine > CREASE_COSINE:
+                            continue
+                        first, second = table[face[b, i, j]], table[face[b, i1, j1]]
+                        at, z, nx, ny, nz = _crease(R[b], t[b], K[b], first, second, i, j, axis)
+                        if not min(here, there) <= z * (1 + step) or not z <= max(here, there) * (1 + step):
+                            continue
                         gain = nx * (g_normals[b, 0, i, j] + g_normals[b, 0, i1, j1])
                         gain += ny * (g_normals[b, 1, i, j] + g_normals[b, 1, i1, j1])
                         gain += nz * (g_normals[b, 2, i, j] + g_normals[b, 2, i1, j1])
@@ -104,26 +110,19 @@ def _crease(
     K: Array,
     first: Array,
     second: Array,
-    normals: Array,
-    depth: Array,
     i: int,
     j: int,
     axis: int,
-    step: float,
 ) -> tuple[float, float, float, float, float]:
     """Where between a pixel and the next along an axis the surface folds: how far along (0 to 1), its depth,
-    and the jump of the normal there; a jump of zero where there is no fold.
+    and the jump of the normal there.
 
     `first` and `second` are the table's rows of the two faces. The fold is where their planes meet, if that
     is between the pixels, else half way, on the nearer plane: a small step of depth. The jump is that of the
     normals interpolated on either side, which on a smooth surface agree.
     """
-    i1, j1 = i + axis, j + 1 - axis
-    cosine = normals[0, i, j] * normals[0, i1, j1] + normals[1, i, j] * normals[1, i1, j1]
-    if cosine + normals[2, i, j] * normals[2, i1, j1] > CREASE_COSINE:
-        return 0.5, 1.0, 0.0, 0.0, 0.0
     dx, dy = (j - K[0, 2]) / K[0, 0], (i - K[1, 2]) / K[1, 1]
-    ex, ey = (j1 - K[0, 2]) / K[0, 0], (i1 - K[1, 2]) / K[1, 1]
+    ex, ey = (j + 1 - axis - K[0, 2]) / K[0, 0], (i + axis - K[1, 2]) / K[1, 1]
     up, down0, _, _, _ = plane(R, t, first, dx, dy)
     _, down1, _, _, _ = plane(R, t, first, ex, ey)
     other_up, other_down0, _, _, _ = plane(R, t, second, dx, dy)
@@ -136,9 +135,6 @@ def _crease(
     elif before + after < 0.0:
         up, down0, down1 = other_up, other_down0, other_down1
     z = up / (down0 + at * (down1 - down0))
-    here, there = depth[i, j], depth[i1, j1]
-    if not min(here, there) <= z * (1 + step) or not z <= max(here, there) * (1 + step):
-        return 0.5, 1.0, 0.0, 0.0, 0.0
     dx, dy = dx + at * (ex - dx), dy + at * (ey - dy)
     x, y, w = turn_back(R, z * dx - t[0], z * dy - t[1], z - t[2])
     ax, ay, az, _ = smooth_normal(first, x, y, w)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from statistics import median
 
-Contenders = dict[str, Callable[[], object]]
+Contenders = Mapping[str, Callable[[], object]]
 Clock = Callable[[], float]
 """Seconds since some moment."""
 

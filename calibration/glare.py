@@ -20,6 +20,7 @@ GLARE_DOLP = 0.2
 """Degree of polarization from which a board's light counts as glare (our choice: print is below 0.1)."""
 
 _SMOOTH_PX = 9  # glare is smooth; the board's own edges, seen by four shifted sites, pass for polarization
+_REGION_PX = 33  # over which glare is judged: a few squares, whose edges cancel
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +62,13 @@ def without_glare(raw: Raw) -> list[Channel]:
 def glare(raw: Raw, where: NDArray[np.bool_]) -> float:
     """The 95th percentile of the smooth degree of polarization over a region (H/2, W/2) of the cells."""
     angles = split_angles(raw).astype(np.float32)
-    mean = cv2.blur(angles.mean(axis=0), (_SMOOTH_PX, _SMOOTH_PX))
-    ratio = _polarized(angles) / np.maximum(2.0 * mean, 1e-6)
+    mean = cv2.blur(angles.mean(axis=0), (_REGION_PX, _REGION_PX))
+    ratio = _polarized(angles, _REGION_PX) / np.maximum(2.0 * mean, 1e-6)
     return float(np.percentile(ratio[where], 95.0)) if where.any() else 0.0
 
 
-def _polarized(angles: NDArray[np.float32]) -> NDArray[np.float32]:
+def _polarized(angles: NDArray[np.float32], smooth_px: int = _SMOOTH_PX) -> NDArray[np.float32]:
     """(H/2, W/2) sqrt(S1^2 + S2^2), of smoothed S1 and S2."""
-    box = (_SMOOTH_PX, _SMOOTH_PX)
+    box = (smooth_px, smooth_px)
     s1, s2 = cv2.blur(angles[0] - angles[2], box), cv2.blur(angles[1] - angles[3], box)
     return np.asarray(np.hypot(s1, s2), np.float32)

@@ -52,7 +52,7 @@ def test_saturated_glare_costs_no_corner(world, monkeypatch, angle_deg):
 def test_without_glare_s0_is_used_alone_and_is_the_most_accurate(world):
     raw, T_cam_board = _glossy(world, 0.0, 0.0)
     found = detect_in_mosaic(raw, "colour", world.spec)
-    assert glare(raw, np.ones((1024, 1224), bool)) < GLARE_DOLP
+    assert glare(raw, np.ones((1024, 1224), bool)) < 0.7 * GLARE_DOLP  # its own edges are no glare
     assert np.sqrt(np.mean(_errors(world, found, T_cam_board) ** 2)) < 0.1
 
 

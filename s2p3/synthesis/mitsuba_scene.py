@@ -26,7 +26,7 @@ _WALL_DEG = (
     40.0,
 )  # elevations between which the wall stands, and where it has faded into the sky
 _SMOOTHEST = 0.002
-_BOUNCES, _BOUNCES_IN_GLASS = 6, 14
+_BOUNCES, _BOUNCES_IN_GLASS = (6, 3), (14, 10)  # at most, and before paths may be ended by chance
 
 
 def scene_dict(mi: Any, scene: Scene) -> dict[str, Any]:
@@ -36,10 +36,14 @@ def scene_dict(mi: Any, scene: Scene) -> dict[str, Any]:
         mi: the module, set to a variant.
     """
     surfaces = [scene.parameters.surface, *(item.surface for item in scene.parameters.clutter)]
-    bounces = _BOUNCES_IN_GLASS if any(surface.kind == "glass" for surface in surfaces) else _BOUNCES
+    glassy = any(surface.kind == "glass" for surface in surfaces)
+    bounces, sure_bounces = _BOUNCES_IN_GLASS if glassy else _BOUNCES
     out: dict[str, Any] = {
         "type": "scene",
-        "integrator": {"type": "stokes", "nested": {"type": "path", "max_depth": bounces}},
+        "integrator": {
+            "type": "stokes",
+            "nested": {"type": "path", "max_depth": bounces, "rr_depth": sure_bounces},
+        },
         "table": _table(mi, scene),
         "light": _surroundings(mi, scene.parameters.light, scene.parameters.wall),
         "object": mesh_shape(mi, scene.model.mesh, scene.model.resting, scene.parameters.surface),
@@ -122,22 +126,21 @@ def bsdf(surface: Surface, reflectance: Any = None) -> dict[str, Any]:
     }
 
 
-def _table(mi: Any, scene: Scene) -> dict[str, Any]:
+def _table(mi: Any, scene: Scene) -> Any:
+    """A square whose corners carry the texture's scale: a transformation of the texture would become part of
+    the kernel, which would then be compiled anew for every scene."""
     parameters = scene.parameters
-    # our texture's middle is at the table's origin
-    repeats = _TABLE_M / parameters.texture_m
-    middle = 0.5 - 0.5 * repeats
-    texture = {
-        "type": "bitmap",
-        "bitmap": _bitmap(mi, parameters.texture),
-        "wrap_mode": "mirror",
-        "to_uv": mi.ScalarTransform4f().translate([middle, middle, 0]).scale([repeats, repeats, 1]),
-    }
-    return {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().scale([_TABLE_M / 2, _TABLE_M / 2, 1]),
-        "bsdf": bsdf(parameters.table, texture),
-    }
+    texture = {"type": "bitmap", "bitmap": _bitmap(mi, parameters.texture), "wrap_mode": "mirror"}
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf(parameters.table, texture))
+    shape = mi.Mesh("table", 4, 2, has_vertex_texcoords=True, props=properties)
+    corners = 0.5 * _TABLE_M * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    table = mi.traverse(shape)
+    table["vertex_positions"] = _flat(np.column_stack([corners, np.zeros(4)]))
+    table["vertex_texcoords"] = _flat(corners / parameters.texture_m + 0.5)  # its middle is at the origin
+    table["faces"] = np.array([0, 1, 2, 0, 2, 3], np.uint32)
+    table.update()
+    return shape
 
 
 def _surroundings(mi: Any, light: Light, wall: Image) -> dict[str, Any]:

@@ -90,41 +90,103 @@ def test_interior_gradients_pass_gradcheck() -> None:
     assert torch.autograd.gradcheck(images, (w, t), eps=1e-5, atol=1e-4)
 
 
-def _mask_loss(
-    mesh: RenderMesh, pose: tuple[Tensor, Tensor, Tensor], step: Tensor, weight: Tensor, oversample: int
+def _weighted(
+    mesh: RenderMesh, pose: tuple[Tensor, Tensor, Tensor], step: Tensor, weight: Tensor, finer: int, name: str
 ) -> Tensor:
+    """A weighted sum of one map, (B,), at poses moved by `step` (B, 6), rendered `finer` times as fine."""
     R, t, K = pose
     K = K.clone()
-    K[:, :2] *= oversample
-    K[:, :2, 2] += (oversample - 1) / 2
-    side = SIZE * oversample
-    turned = _rotate(step[None, :3]) @ R
-    mask = render(mesh, turned, t + step[None, 3:], K, side, side).mask
-    return (torch.nn.functional.avg_pool2d(mask, oversample) * weight).sum()
+    K[:, :2] *= finer
+    K[:, :2, 2] += (finer - 1) / 2
+    side = SIZE * finer
+    output = render(mesh, _rotate(step[:, :3]) @ R, t + step[:, 3:], K, side, side)
+    return (torch.nn.functional.avg_pool2d(getattr(output, name), finer) * weight).sum((1, 2, 3))
+
+
+def _gradients(
+    model: objects.ObjectModel, views: int, finer: int, name: str, sizes: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Gradients at `finer` times the resolution, and central differences at four times, both (views, 6)."""
+    mesh = RenderMesh.from_mesh(model.mesh)
+    pose = _views(model, views, seed=0)
+    rough = torch.randn(views, 3, 5, 5, generator=torch.Generator().manual_seed(0))
+    weight = torch.nn.functional.interpolate(rough, (SIZE, SIZE), mode="bicubic")
+    weight = weight[:, :1] if name == "mask" else weight
+    step = torch.zeros(views, 6, requires_grad=True)
+    (gradient,) = torch.autograd.grad(_weighted(mesh, pose, step, weight, finer, name).sum(), step)
+    with torch.no_grad():
+        change = [
+            _weighted(mesh, pose, d.expand(views, 6), weight, 4, name)
+            - _weighted(mesh, pose, -d.expand(views, 6), weight, 4, name)
+            for d in torch.diag(sizes)
+        ]
+    return gradient, torch.stack(change, dim=1) / (2 * sizes)
+
+
+def _agree(ours: Tensor, theirs: Tensor, cosine: float, scale: float) -> None:
+    for part in (slice(0, 3), slice(3, 5), slice(5, 6)):
+        a, b = ours[:, part].flatten(), theirs[:, part].flatten()
+        assert torch.nn.functional.cosine_similarity(a, b, dim=0) > cosine
+        assert float(a.norm() / b.norm()) == pytest.approx(1, abs=scale)
 
 
 def test_silhouette_gradients_follow_finite_differences(model: objects.ObjectModel) -> None:
-    mesh, views = RenderMesh.from_mesh(model.mesh), 6
-    gradients, differences = [], []
-    for seed in range(views):
-        pose = _views(model, 1, seed)
-        rough = torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(seed))
-        weight = torch.nn.functional.interpolate(rough, (SIZE, SIZE), mode="bicubic")
-        step = torch.zeros(6, requires_grad=True)
-        (gradient,) = torch.autograd.grad(_mask_loss(mesh, pose, step, weight, 1), step)
-        gradients.append(gradient)
-        sizes = torch.tensor([0.01] * 3 + [0.003 * model.diameter] * 3)
-        with torch.no_grad():
-            change = [
-                _mask_loss(mesh, pose, d, weight, 4) - _mask_loss(mesh, pose, -d, weight, 4)
-                for d in torch.diag(sizes)
-            ]
-        differences.append(torch.stack(change) / (2 * sizes))
-    ours, theirs = torch.stack(gradients), torch.stack(differences)
-    for part in (slice(0, 3), slice(3, 6)):
-        a, b = ours[:, part].flatten(), theirs[:, part].flatten()
-        assert torch.nn.functional.cosine_similarity(a, b, dim=0) > 0.97
-        assert 0.9 < float(a.norm() / b.norm()) < 1.1
+    sizes = torch.tensor([0.02] * 3 + [0.005 * model.diameter] * 2 + [0.04 * model.diameter])
+    _agree(*_gradients(model, 8, 1, "mask", sizes), cosine=0.97, scale=0.1)
+
+
+@pytest.mark.parametrize("name", ["cup", "knife", "bottle"])
+def test_gradients_of_normals_follow_finite_differences_across_creases(name: str) -> None:
+    model = objects.build(name)
+    sizes = torch.tensor([0.02] * 3 + [0.005 * model.diameter] * 2 + [0.04 * model.diameter])
+    _agree(*_gradients(model, 8, 4, "normals", sizes), cosine=0.9, scale=0.25)
+
+
+def test_the_edge_of_a_folded_plate_moves_its_normals() -> None:
+    box = RenderMesh.from_mesh(Mesh.from_arrays(*object_meshes.box((0.2, 0.2, 0.2))))
+    R = _rotate(torch.tensor([[0.0, np.pi / 4, 0]]))  # one upright edge towards the camera
+    t = torch.tensor([[0.0, 0, 0.6]], requires_grad=True)
+    K = torch.tensor([[[150.0, 0, 63], [0, 150, 63], [0, 0, 1]]])
+    output = render(box, R, t, K, SIZE, SIZE)
+    near = torch.zeros(1, 3, SIZE, SIZE)
+    near[:, 0, 54:74, 50:78] = 1  # around the edge alone
+    (gradient,) = torch.autograd.grad((output.normals * near).sum(), t)
+    jump, rows, depth = -np.sqrt(2), 20, 0.6 - 0.1 * np.sqrt(2)  # left minus right, of the normals' x
+    assert float(gradient[0, 0]) == pytest.approx(jump * rows * 150 / depth, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["cup", "knife"])
+def test_mask_and_normals_lead_back_to_the_pose(name: str) -> None:
+    model = objects.build(name)
+    mesh = RenderMesh.from_mesh(model.mesh)
+    R, true, K = _views(model, 2, seed=8)
+    target = render(mesh, R, true, K, SIZE, SIZE)
+    change = torch.zeros(2, 6, requires_grad=True)
+    start = _rotate(torch.tensor([[0.06, -0.05, 0.03]])) @ R
+    moved = true + model.diameter * torch.tensor([0.02, 0.02, 0.01])
+    optimizer = torch.optim.Adam([change], lr=0.01)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 100)
+
+    def distance() -> Tensor:
+        points = torch.from_numpy(model.surface_points(200)).float()
+        turned = _rotate(change[:, :3]) @ start
+        shift = moved + 0.5 * model.diameter * change[:, 3:] - true
+        apart = points @ (turned - R).transpose(1, 2) + shift[:, None]
+        return apart.detach().norm(dim=-1).mean(1) / model.diameter
+
+    before = distance()
+    for _ in range(100):
+        pose = _rotate(change[:, :3]) @ start, moved + 0.5 * model.diameter * change[:, 3:]
+        output = render(mesh, *pose, K, SIZE, SIZE)
+        apart = (output.normals_interior - target.normals).square().sum(1, keepdim=True)
+        same = output.mask.detach() * target.mask * (apart.detach() < 0.25)
+        mask = torch.nn.functional.avg_pool2d(output.mask - target.mask, 4).square().sum()
+        optimizer.zero_grad()
+        (16 * mask + 5 * (apart * same).sum()).backward()
+        optimizer.step()
+        schedule.step()
+    assert (before > 0.03).all()
+    assert (distance() < 0.02).all()
 
 
 def test_a_ball_that_comes_nearer_grows_and_one_that_turns_keeps_its_outline() -> None:

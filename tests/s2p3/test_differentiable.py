@@ -135,11 +135,11 @@ def test_silhouette_gradients_follow_finite_differences(model: objects.ObjectMod
     _agree(*_gradients(model, 8, 1, "mask", sizes), cosine=0.97, scale=0.1)
 
 
-@pytest.mark.parametrize("name", ["cup", "knife", "bottle"])
-def test_gradients_of_normals_follow_finite_differences_across_creases(name: str) -> None:
+@pytest.mark.parametrize(("name", "cosine"), [("cup", 0.9), ("fork", 0.8), ("knife", 0.9), ("bottle", 0.9)])
+def test_gradients_of_normals_follow_finite_differences_across_creases(name: str, cosine: float) -> None:
     model = objects.build(name)
     sizes = torch.tensor([0.02] * 3 + [0.005 * model.diameter] * 2 + [0.04 * model.diameter])
-    _agree(*_gradients(model, 8, 4, "normals", sizes), cosine=0.9, scale=0.25)
+    _agree(*_gradients(model, 8, 4, "normals", sizes), cosine, scale=0.25)
 
 
 def test_the_edge_of_a_folded_plate_moves_its_normals() -> None:
@@ -159,34 +159,41 @@ def test_the_edge_of_a_folded_plate_moves_its_normals() -> None:
 def test_mask_and_normals_lead_back_to_the_pose(name: str) -> None:
     model = objects.build(name)
     mesh = RenderMesh.from_mesh(model.mesh)
-    R, true, K = _views(model, 2, seed=8)
-    target = render(mesh, R, true, K, SIZE, SIZE)
-    change = torch.zeros(2, 6, requires_grad=True)
-    start = _rotate(torch.tensor([[0.06, -0.05, 0.03]])) @ R
-    moved = true + model.diameter * torch.tensor([0.02, 0.02, 0.01])
-    optimizer = torch.optim.Adam([change], lr=0.01)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 100)
+    R, t, K = _views(model, 3, seed=8)
+    target = render(mesh, R, t, K, SIZE, SIZE)
+    start = (
+        _rotate(torch.tensor([[0.06, -0.05, 0.03]])) @ R,
+        t + model.diameter * torch.tensor([0.02, 0.02, 0.01]),
+    )
+    points = torch.from_numpy(model.surface_points(200)).float()
 
-    def distance() -> Tensor:
-        points = torch.from_numpy(model.surface_points(200)).float()
-        turned = _rotate(change[:, :3]) @ start
-        shift = moved + 0.5 * model.diameter * change[:, 3:] - true
-        apart = points @ (turned - R).transpose(1, 2) + shift[:, None]
-        return apart.detach().norm(dim=-1).mean(1) / model.diameter
+    def moved(change: Tensor) -> tuple[Tensor, Tensor]:
+        return _rotate(change[:, :3]) @ start[0], start[1] + 0.5 * model.diameter * change[:, 3:]
 
-    before = distance()
-    for _ in range(100):
-        pose = _rotate(change[:, :3]) @ start, moved + 0.5 * model.diameter * change[:, 3:]
-        output = render(mesh, *pose, K, SIZE, SIZE)
+    def distance(change: Tensor) -> Tensor:
+        turned, shifted = moved(change)
+        apart = points @ (turned - R).transpose(1, 2) + (shifted - t)[:, None]
+        return apart.norm(dim=-1).mean(1) / model.diameter
+
+    steps = 100
+    change, mean, moment = torch.zeros(3, 6), torch.zeros(3, 6), torch.zeros(3, 6, 6)
+    assert (distance(change) > 0.03).all()
+    for i in range(steps):  # Adam with the whole second moment: tilt and distance look alike
+        change.requires_grad_()
+        output = render(mesh, *moved(change), K, SIZE, SIZE)
         apart = (output.normals_interior - target.normals).square().sum(1, keepdim=True)
         same = output.mask.detach() * target.mask * (apart.detach() < 0.25)
-        mask = torch.nn.functional.avg_pool2d(output.mask - target.mask, 4).square().sum()
-        optimizer.zero_grad()
-        (16 * mask + 5 * (apart * same).sum()).backward()
-        optimizer.step()
-        schedule.step()
-    assert (before > 0.03).all()
-    assert (distance() < 0.02).all()
+        difference = output.mask - target.mask
+        coarse = torch.nn.functional.avg_pool2d(difference, 4)
+        loss = difference.square().sum() + 16 * coarse.square().sum() + 5 * (apart * same).sum()
+        (gradient,) = torch.autograd.grad(loss, change)
+        mean = 0.8 * mean + 0.2 * gradient
+        moment = 0.95 * moment + 0.05 * gradient[:, :, None] * gradient[:, None]
+        values, axes = torch.linalg.eigh(moment / (1 - 0.95 ** (i + 1)))
+        scale = (values.clamp_min(0) + 1e-4 * values[:, -1:] + 1e-16).sqrt()[:, :, None]
+        step = axes @ (axes.transpose(1, 2) @ mean[:, :, None] / scale) / (1 - 0.8 ** (i + 1))
+        change = change.detach() - 0.03 * (1 - i / steps) * step[:, :, 0]
+    assert (distance(change) < 0.02).all()
 
 
 def test_a_ball_that_comes_nearer_grows_and_one_that_turns_keeps_its_outline() -> None:

@@ -25,7 +25,7 @@ STEPS, RATE = 160, 0.03
 NORMALS = 5.0  # weight of the normals against the mask's 1
 SAME_SURFACE = 0.25  # squared difference of unit normals (29 deg) from which a pixel shows another surface
 FIRST, SECOND = 0.8, 0.95  # decay of the gradient's running mean and second moment
-RETRIES, EXPLAINED = 3, 0.01  # from other starts, where the picture disagrees by more
+RETRIES, EXPLAINED = 3, 0.01  # more attempts, where the pictures disagree by more
 FLOOR = 1e-4  # of the second moment, against its largest eigenvalue: keeps what no pixel feels at rest
 
 Pose = tuple[Tensor, Tensor, Tensor]
@@ -102,8 +102,8 @@ def recover(mesh: RenderMesh, diameter: float, start: Pose, target: RenderOutput
 def explain(
     mesh: RenderMesh, diameter: float, start: Pose, target: RenderOutput, generator: torch.Generator
 ) -> Pose:
-    """`recover`, and again from beside `start`, up to `RETRIES` times, for the poses whose picture still
-    disagrees with the target: of every pose the attempt that explains its picture best."""
+    """`recover`, and again from beside what was found, up to `RETRIES` times, for the poses whose picture
+    still disagrees with the target: of every pose the attempt that explains its picture best."""
     size = target.mask.shape[-1]
     (R, t, K), loss = start, torch.full((len(start[0]),), torch.inf)
     for attempt in range(1 + RETRIES):
@@ -111,7 +111,7 @@ def explain(
         if len(rows) == 0:
             break
         goal = RenderOutput(*(getattr(target, field.name)[rows] for field in fields(target)))
-        begin = start[0][rows], start[1][rows], K[rows]
+        begin = R[rows], t[rows], K[rows]
         if attempt:
             begin = perturbed(begin, 5, 0.03 * diameter, generator)
         found = recover(mesh, diameter, begin, goal)

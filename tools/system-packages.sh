@@ -15,7 +15,8 @@ if ! command -v apt-get >/dev/null; then
   echo "set-up: this is not Debian or Ubuntu; install the equivalents of: ${missing[*]}" >&2
   exit 1
 fi
-has_candidate() { apt-cache policy "$1" 2>/dev/null | grep -qE '^ *Candidate: [^(]'; }
+# A here-string, not a pipe: grep stops reading at the first match, and pipefail would blame apt-cache for that.
+has_candidate() { grep -qE '^ *Candidate: [^(]' <<<"$(apt-cache policy "$1" 2>/dev/null)"; }
 # Adds the optional packages that apt can install to the missing ones.
 choose_optional() {
   local package

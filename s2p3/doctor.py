@@ -45,22 +45,22 @@ class Check:
     fix: str = ""
 
 
-def doctor(rig: Rig | None = None, folder: Path | None = None) -> list[Check]:
-    """Checks this machine and, where a rig is given, its devices; the arm is not moved.
+def doctor(rig: Rig | None = None, folder: Path | None = None) -> Iterator[Check]:
+    """Checks this machine and, where a rig is given, its devices, one after another; the arm is not moved.
 
     Args:
         rig: whose devices to ask; a device that does not answer is given up after at most 5 s.
         folder: where sessions will be written; the current one by default.
 
-    Returns:
-        One check a line; nothing is raised for what is missing or does not answer.
+    Yields:
+        One check a line, as soon as it is made; nothing is raised for what is missing or does not answer.
     """
-    checks = [*_machine_checks(), *_disk_checks(rig, folder or Path.cwd())]
+    yield from _machine_checks()
+    yield from _disk_checks(rig, folder or Path.cwd())
     if rig is not None:
         from s2p3.doctor_devices import device_checks
 
-        checks += device_checks(rig)
-    return checks
+        yield from device_checks(rig)
 
 
 def _machine_checks() -> Iterator[Check]:
@@ -68,6 +68,7 @@ def _machine_checks() -> Iterator[Check]:
     yield _packages()
     yield _opencv()
     yield _aravis()
+    yield _cameras()
     yield _ur_rtde()
     yield _threads()
     yield _gpu()
@@ -115,6 +116,18 @@ def _aravis() -> Check:
     except ToolkitError as error:
         return failed("Aravis", error)
     return Check("Aravis", True, f"0.8, PyGObject {_version('PyGObject')}")
+
+
+def _cameras() -> Check:
+    """The cameras that answer a call on every network: their addresses go into a rig file."""
+    from acquisition.cameras.discovery import find_cameras
+
+    try:
+        found = find_cameras()
+    except ToolkitError as error:
+        return failed("cameras in sight", error)
+    listed = ", ".join(f"{camera.model} {camera.serial} at {camera.address}" for camera in found)
+    return Check("cameras in sight", True, listed or "none that speaks GigE Vision")
 
 
 def _ur_rtde() -> Check:

@@ -179,7 +179,7 @@ def _arm_stream(rig: Rig) -> Check:
     from acquisition.robots.stream import RtdeStream
 
     try:
-        stream = RtdeStream(rig.robot.host, rig.robot.frequency_hz)
+        stream = RtdeStream(rig.robot.host, rig.robot.frequency_hz, rig.robot.silence_s)
         try:
             stream.start_trace()
             time.sleep(_TRIAL_S)

@@ -102,8 +102,9 @@ def _read(address: str, register: int) -> tuple[str, int]:
             "the camera (or the simulated one) is running"
         )
     raise DeviceError(
-        f"no camera answers at {address} (UDP port {PORT}); check the address (arv-tool-0.8 lists cameras), "
-        "power and cable, that this computer is in the same subnet, and that the firewall lets UDP through"
+        f"no camera answers at {address} (UDP port {PORT}); check the address (s2p3 doctor lists the cameras "
+        "in sight), power and cable, that this computer is in the same subnet, and that the firewall lets "
+        "UDP through"
     )
 
 

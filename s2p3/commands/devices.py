@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
 from s2p3.commands.arguments import ObjectName, OptionalPath
 from s2p3.commands.output import console, say, show
+
+if TYPE_CHECKING:
+    from s2p3.doctor import Check
 
 _LOOK_S = 10.0
 
@@ -25,26 +29,29 @@ def doctor(*, rig: OptionalPath = None, json: bool = False) -> None:
     from dataset.errors import ToolkitError
     from s2p3.doctor import doctor as run_checks
 
-    checks = run_checks(None if rig is None else Rig.load(rig))
+    checks = []
+    for check in run_checks(None if rig is None else Rig.load(rig)):
+        checks.append(check)
+        if not json:
+            _print(check)
     if json:
         show(
             {check.name: {"ok": check.ok, "detail": check.detail, "fix": check.fix} for check in checks},
             as_json=True,
         )
-    else:
-        for check in checks:
-            mark = "[green]ok  [/green]" if check.ok else "[red]FAIL[/red]"
-            console.print(
-                f"{mark} {check.name}: {escape(check.detail)}"
-                + ("" if check.ok else f"  [bold]Fix:[/bold] {escape(check.fix)}"),
-                soft_wrap=True,
-            )
     failed = [check.name for check in checks if not check.ok]
     if failed:
         raise ToolkitError(
             f"doctor: {len(failed)} of {len(checks)} checks failed ({', '.join(failed)}); "
             "each line above says the fix"
         )
+
+
+def _print(check: Check) -> None:
+    mark = "[green]ok  [/green]" if check.ok else "[red]FAIL[/red]"
+    console.print(f"{mark} {check.name}: {escape(check.detail)}", soft_wrap=True)
+    if not check.ok:
+        console.print(f"     [bold]Fix:[/bold] {escape(check.fix)}", soft_wrap=True)
 
 
 def simulate(

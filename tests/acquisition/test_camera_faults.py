@@ -41,6 +41,31 @@ def test_silence_at_the_address() -> None:
         assert time.monotonic() - started < 5
 
 
+CLIENT = """
+import time
+from acquisition.camera import CameraConfig
+from acquisition.cameras.aravis import AravisCamera
+camera = AravisCamera(CameraConfig("127.0.0.1"))
+camera.start()
+camera.read()
+print("streaming", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_client_that_was_killed_gives_the_camera_back() -> None:
+    with SimulatedCamera(**SMALL):
+        with subprocess.Popen([sys.executable, "-c", CLIENT], stdout=subprocess.PIPE, text=True) as client:
+            assert client.stdout is not None
+            assert client.stdout.readline() == "streaming\n"
+            client.kill()
+        started = time.monotonic()
+        with AravisCamera(CameraConfig("127.0.0.1")) as camera:
+            camera.start()
+            assert camera.read().missing_packets == 0
+        assert time.monotonic() - started < 6  # the camera's heartbeat is 3 s
+
+
 def test_missing_aravis_names_the_packages() -> None:
     script = (
         "import sys; sys.modules['gi'] = None\n"  # what Python does when a package is not there

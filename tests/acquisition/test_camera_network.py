@@ -30,6 +30,7 @@ import json, os, subprocess, sys
 from dataclasses import asdict
 from acquisition.camera import CameraConfig
 from acquisition.cameras.aravis import AravisCamera
+from acquisition.cameras.discovery import find_cameras
 from acquisition.cameras.packet_test import largest_delivered, try_packet_sizes
 from acquisition.simulation.camera import SimulatedCamera
 from dataset.errors import DeviceError
@@ -125,7 +126,9 @@ except DeviceError as error:
 subprocess.run(["ip", "addr", "add", "127.0.0.2/8", "dev", "lo"], check=True)
 one = SimulatedCamera("127.0.0.1", serial="ONE", **SMALL)
 two = SimulatedCamera("127.0.0.2", serial="TWO", **SMALL)
+found["none in sight"] = find_cameras()
 with one, two:
+    found["in sight"] = [asdict(camera) for camera in find_cameras()]
     with AravisCamera(CameraConfig("127.0.0.1")) as first, AravisCamera(CameraConfig("127.0.0.2")) as second:
         first.start()
         second.start()
@@ -136,6 +139,12 @@ print(json.dumps(found))
     )
     found = json.loads(in_a_network_of_its_own(script))
     assert "no network card has; add it with: ip addr add 127.0.0.2/8 dev lo" in found["without the address"]
+    assert found["none in sight"] == []
+    seen = {"vendor": "Lucid Vision Labs", "model": "PHX050S-Q"}
+    assert found["in sight"] == [
+        {"address": "127.0.0.1", "serial": "ONE", **seen},
+        {"address": "127.0.0.2", "serial": "TWO", **seen},
+    ]
     assert found["serials"] == ["ONE", "TWO"]
     assert found["frames"] == [5, 5]
 

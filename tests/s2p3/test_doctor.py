@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,10 @@ from dataset.frames import RawFrame
 from s2p3.doctor import Check, doctor
 from s2p3.doctor_devices import stream_check
 
-MACHINE = ["Python", "packages", "OpenCV", "Aravis", "ur_rtde", "CPU", "GPU", "disk space", "disk speed"]
+MACHINE = [
+    *("Python", "packages", "OpenCV", "Aravis", "cameras in sight", "ur_rtde", "CPU", "GPU"),
+    *("disk space", "disk speed"),
+]
 
 ASKED = [
     *("camera", "network", "camera stream", "camera clock", "packet test"),
@@ -25,7 +29,8 @@ ASKED = [
 ]
 
 
-def by_name(checks: list[Check]) -> dict[str, Check]:
+def by_name(made: Iterable[Check]) -> dict[str, Check]:
+    checks = list(made)
     names = [check.name for check in checks]
     assert len(set(names)) == len(names)
     for check in checks:
@@ -70,7 +75,7 @@ def test_more_bits_and_frames_need_a_faster_disk(tmp_path: Path) -> None:
 def test_devices_that_do_not_answer_are_failing_lines(tmp_path: Path, address: str) -> None:
     rig = Rig(CameraTable(address), RobotTable(address))
     began = time.monotonic()
-    without = doctor(folder=tmp_path)
+    without = list(doctor(folder=tmp_path))
     between = time.monotonic()
     checks = by_name(doctor(rig, tmp_path))
     assert (time.monotonic() - between) - (between - began) < 10.0  # two devices, 5 s each
@@ -90,6 +95,7 @@ def test_devices_that_answer_are_described(tmp_path: Path, simulated_camera: Sim
         checks = by_name(doctor(rig, tmp_path))
         after = joints(host)
     assert list(checks) == [*MACHINE, *ASKED]
+    assert "PHX050S-Q SIM00001 at 127.0.0.1" in checks["cameras in sight"].detail
     assert "PHX050S-Q SIM00001" in checks["camera"].detail
     assert "256x192 BayerRG8" in checks["camera"].detail
     assert "lo to 127.0.0.1, MTU" in checks["network"].detail

@@ -11,27 +11,46 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataset import SE3
 from dataset.bop import export_bop
-from dataset.session import ObjectPoses, Session, mask_box, write_object, write_poses
-from s2p3.objects import build
+from dataset.session import ObjectPoses, ObjectRecord, Session, mask_box, write_object, write_poses
 from s2p3.silhouettes import Silhouettes
 
 HERE = Path(__file__).parent
-OBJECTS = ("cup", "fork")
+SESSION = "session.h5"
+SIDES = 24
+
+
+def objects() -> dict[str, ObjectRecord]:
+    """By name: a tube, which looks nearly the same when turned, and a wedge. Made by formula, so that the
+    stored errors hold whatever becomes of the toolkit's own objects."""
+    turn = np.arange(SIDES) * 2 * np.pi / SIDES
+    ring = 0.035 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    rings = [np.column_stack([ring, np.full(SIDES, height)]) for height in (-0.05, 0.05)]
+    here, there = np.arange(SIDES), (np.arange(SIDES) + 1) % SIDES
+    wall = [
+        np.stack([here, there, here + SIDES], axis=1),
+        np.stack([there, there + SIDES, here + SIDES], axis=1),
+    ]
+    corners = 0.04 * np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [-1, 1, 1]])
+    sides = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [3, 5, 2], [0, 4, 5], [0, 5, 3], [1, 2, 5], [1, 5, 4]])
+    return {
+        "tube": _record("tube", np.concatenate(rings), np.concatenate(wall)),
+        "wedge": _record("wedge", corners, sides),
+    }
 
 
 def exported(folder: Path) -> Path:
-    """The golden session with two built-in objects, exported as a BOP data set."""
-    path = Path(shutil.copy(HERE / "session-1.1.h5", folder / "session.h5"))
+    """The golden session with both objects, exported as a BOP data set; the session stays beside it."""
+    path = Path(shutil.copy(HERE / "session-1.1.h5", folder / SESSION))
     draw = Silhouettes()
     with Session.open(path) as session:
         turns, camera = session.object_poses("tetra").T_cam_obj.rotation, session.working_intrinsics
     poses = SE3(turns, np.tile([0.0, 0.0, 0.18], (len(turns), 1)))
     found = {}
-    for name in OBJECTS:
-        record = build(name).to_record()
+    for name, record in objects().items():
         write_object(path, record)
         masks = np.stack([draw(record, poses[index], camera) for index in range(len(turns))])
         boxes = np.stack([mask_box(mask) for mask in masks])
@@ -61,6 +80,11 @@ def errors(root: Path) -> list[dict[str, Any]]:
             }
             rows.append(row | {"add": float(pose_error.add(*poses)), "adi": float(pose_error.adi(*poses))})
     return rows
+
+
+def _record(name: str, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> ObjectRecord:
+    apart = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1)
+    return ObjectRecord(name, vertices, faces.astype(np.int32), "plastic", 1.5, 0.0, "{}", float(apart.max()))
 
 
 if __name__ == "__main__":

@@ -122,10 +122,10 @@ class GenTLFeatures(Features):
         with self._explain(command, "execute"):
             self._nodes.get_node(command).execute()
 
-    def refresh(self, feature: str) -> None:
-        """Reads it from the camera, not from memory."""
+    def reread(self, feature: str) -> str:
+        """Its value as text, from the camera and not from memory."""
         with self._explain(feature, "read"):
-            self._nodes.get_node(feature).get_value(False, True)
+            return str(self._nodes.get_node(feature).to_string(False, True))
 
     @contextlib.contextmanager
     def _explain(self, feature: str, verb: str) -> Iterator[None]:

@@ -27,6 +27,7 @@ from dataset.frames import CameraInfo
 PRODUCERS_VARIABLE = "GENICAM_GENTL64_PATH"
 """Where GenTL producers are by the standard: folders, separated by colons."""
 
+_PRIVILEGE, _NOBODYS = "GevCCP", "OpenAccess"  # who controls a GigE Vision camera; one that restarted: nobody
 _BUFFERS = 12
 _OPEN_TIMEOUT_S = 20.0
 _CLOSE_TIMEOUT_S = 10.0
@@ -154,12 +155,18 @@ class HarvestersCamera(QueuedCamera):
         return self._grabber.underruns if self._grabber is not None else 0
 
     def _check_presence(self) -> None:
+        nodes = self._nodes
         try:
-            self._nodes.refresh("Width")
+            nodes.reread("Width")
+            privilege = nodes.reread(_PRIVILEGE) if nodes.has(_PRIVILEGE) else ""
         except DeviceError as error:
             raise CameraLost(
                 f"{self._name} stopped answering; check its power and cable, then open it again ({error})"
             ) from error
+        if privilege == _NOBODYS:
+            raise CameraLost(
+                f"{self._name} was restarted, or lost sight of this computer for seconds; open it again"
+            )
 
     def _explain_silence(self) -> str:
         statistics = self.statistics

@@ -1,5 +1,5 @@
-"""What every camera driver promises, held against real peers: the simulated camera through Aravis, and the
-GenTL producer that ships with genicam through harvesters."""
+"""What every camera driver promises, held against real peers: the simulated camera through Aravis and through
+harvesters, and the producer that ships with genicam through harvesters."""
 
 from __future__ import annotations
 
@@ -24,21 +24,19 @@ from dataset.session import Session, SessionWriter
 Open = Callable[..., Camera]
 
 
-def viky() -> CameraConfig:
-    genicam = pytest.importorskip("genicam")
-    producer = Path(genicam.__file__).with_name("viky.cti")
-    return CameraConfig("1", pixel_format="Mono8", frame_rate=100, producer=str(producer))
-
-
-@pytest.fixture(scope="module", params=["aravis", "harvesters"])
-def opener(request: pytest.FixtureRequest) -> Iterator[Open]:
+@pytest.fixture(scope="module", params=["aravis", "harvesters", "viky"])
+def opener(request: pytest.FixtureRequest, viky: CameraConfig, gige_producer: Path) -> Iterator[Open]:
     """Opens the peer's camera, with changes to its configuration."""
-    if request.param == "harvesters":
-        yield lambda **changes: HarvestersCamera(replace(viky(), **changes))
+    if request.param == "viky":
+        yield lambda **changes: HarvestersCamera(replace(viky, **changes))
         return
     with SimulatedCamera(width=256, height=192, frame_rate=100, latency_s=0.002):
-        config = CameraConfig("127.0.0.1", frame_rate=100)
-        yield lambda **changes: AravisCamera(replace(config, **changes))
+        if request.param == "aravis":
+            config = CameraConfig("127.0.0.1", frame_rate=100)
+            yield lambda **changes: AravisCamera(replace(config, **changes))
+        else:
+            config = CameraConfig("SIM00001", frame_rate=100, producer=str(gige_producer))
+            yield lambda **changes: HarvestersCamera(replace(config, **changes))
 
 
 @pytest.mark.devices
@@ -159,49 +157,3 @@ class TestEveryCamera:
             assert session.camera == camera.info
             for index, frame in enumerate(frames):
                 np.testing.assert_array_equal(session.raw(index), frame.pixels)
-
-
-class TestGenTL:
-    """What only the harvesters driver does."""
-
-    def test_times_of_arrival_are_called_the_hosts(self) -> None:
-        with HarvestersCamera(viky()) as camera:
-            assert camera.info.clock == "host"
-            camera.start()
-            frame = camera.read()
-        assert np.isnan(frame.exposure_us)
-        assert np.isnan(frame.gain_db)
-
-    def test_the_producer_is_found_where_the_standard_says(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        config = viky()
-        assert config.producer is not None
-        monkeypatch.setenv("GENICAM_GENTL64_PATH", f"/nowhere:{Path(config.producer).parent}")
-        with HarvestersCamera(replace(config, producer=None)) as camera:
-            assert camera.info.model == "Viky"
-
-    def test_what_is_missing_is_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
-        config = viky()
-        with pytest.raises(DeviceError, match=r"GENICAM_GENTL64_PATH names no folder.*as producer"):
-            HarvestersCamera(replace(config, producer=None))
-        with pytest.raises(DeviceError, match=r"no GenTL producer /nowhere\.cti; correct producer"):
-            HarvestersCamera(replace(config, producer="/nowhere.cti"))
-        with pytest.raises(DeviceError, match=r"0 cameras are called 'nobody'.*id VikyTL_DEV_blue"):
-            HarvestersCamera(replace(config, address="nobody"))
-        with pytest.raises(DeviceError, match="3 cameras are called 'Viky'"):
-            HarvestersCamera(replace(config, address="Viky"))
-
-    def test_a_file_that_is_no_producer(self, tmp_path: Path) -> None:
-        fake = tmp_path / "fake.cti"
-        fake.write_text("not a library")
-        with pytest.raises(DeviceError, match=r"fake\.cti lists none: check cable and power"):
-            HarvestersCamera(replace(viky(), producer=str(fake)))
-
-    @pytest.mark.parametrize("trigger", ["software", "line"])
-    def test_a_camera_without_triggers_says_so(self, trigger: str) -> None:
-        with HarvestersCamera(viky()) as camera, pytest.raises(DeviceError, match="cannot be triggered"):
-            camera.start(trigger)
-
-    def test_a_camera_that_another_program_has(self) -> None:
-        with HarvestersCamera(viky()), pytest.raises(DeviceError, match="close others"):
-            HarvestersCamera(viky())

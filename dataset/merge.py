@@ -218,7 +218,7 @@ def _write_camera(target: h5py.File, parts: list[_Part], forget_clocks: bool) ->
         _put(target, f"camera/{name}", np.concatenate(columns))
     target["camera"].attrs.update(dict(parts[0].file["camera"].attrs))
     if sessions[0].has_depth:
-        images = (s.contents.image("depth", "depth_crc32", i) for s in sessions for i in range(len(s)))
+        images = (s.contents.image("depth", i) for s in sessions for i in range(len(s)))
         store_images(
             target, declaration("depth"), images, (shape[0], *sessions[0].camera.working_size), np.uint16
         )

@@ -62,7 +62,7 @@ class Dataset:
         required: whether every file has it, or every instance of its parent when the path holds a `*`.
         chunk: rows per HDF5 chunk of a dataset that grows frame by frame or sample by sample; 0 otherwise.
         compressed: whether chunks pass the Blosc2 filter (LZ4, bit shuffle): one chunk an image, with its
-            checksum in the dataset `checksums`. All others carry the attribute `crc32`.
+            checksum in the dataset named by `checksums_of`. All others carry the attribute `crc32`.
     """
 
     path: str
@@ -73,11 +73,6 @@ class Dataset:
     required: bool = True
     chunk: int = 0
     compressed: bool = False
-
-    @property
-    def checksums(self) -> str:
-        """Path of the dataset with one CRC-32 an image, for datasets of images."""
-        return "camera/crc32" if self.path == "camera/raw" else f"{self.path}_crc32"
 
 
 ATTRIBUTES: tuple[Attribute, ...] = (
@@ -322,6 +317,11 @@ CAMERA_ATTRIBUTES: tuple[Attribute, ...] = tuple(a for a in ATTRIBUTES if a.grou
 def declaration(path: str) -> Dataset:
     """The declaration of a dataset by its path, `*` included."""
     return _BY_PATH[path]
+
+
+def checksums_of(images: str) -> str:
+    """Path of the dataset with one CRC-32 an image, from that of the images."""
+    return "camera/crc32" if images == "camera/raw" else f"{images}_crc32"
 
 
 def matching(declared: str, path: str) -> bool:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dataset.compression import checksum
 from dataset.errors import SessionError
+from dataset.schema import checksums_of
 from dataset.session.files import attribute, reading
 from dataset.session.seals import intact
 
@@ -75,13 +76,13 @@ class Contents:
                 raise _damaged(self.path, path)
         return data
 
-    def image(self, path: str, checksums: str, index: int) -> Any:
+    def image(self, path: str, index: int) -> Any:
         """One image of a dataset of images, held against its checksum (masks of schema 1.0 have none).
 
         Raises:
             SessionError: absent or damaged.
         """
-        image = self.read(path, index)
+        image, checksums = self.read(path, index), checksums_of(path)
         if self.has(checksums) and checksum(image) != int(self.read(checksums, index)):
             raise _damaged(self.path, f"{path}[{index}]")
         return image
@@ -123,7 +124,7 @@ class StoredMasks:
         return self._contents.length(self._path)
 
     def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
-        mask: NDArray[np.bool_] = self._contents.image(self._path, f"{self._path}_crc32", index) != 0
+        mask: NDArray[np.bool_] = self._contents.image(self._path, index) != 0
         return mask
 
 

@@ -16,7 +16,7 @@ from dataset.errors import SessionError
 from dataset.frames import SUPERPIXEL
 from dataset.intrinsics import Intrinsics
 from dataset.polarizer_response import PolarizerResponse
-from dataset.schema import Dataset, declaration
+from dataset.schema import Dataset, checksums_of, declaration
 from dataset.session.files import dtype_of, make_dataset, open_for_editing
 from dataset.session.records import ObjectPoses, ObjectRecord
 from dataset.session.seals import leave_open
@@ -234,7 +234,7 @@ def store_images(
         chunk = compress(image)
         stored.id.write_direct_chunk((index, 0, 0), chunk.data)
         checksums[index] = chunk.crc32
-    beside = declaration(declared.checksums)
+    beside = declaration(checksums_of(declared.path))
     make_dataset(file, beside, beside.path.replace("*", name), checksums, checksums.shape, np.uint32)
 
 

@@ -162,7 +162,7 @@ class Session:
             SessionError: there is none, or it is damaged.
             IndexError: there is no such frame.
         """
-        image = self.contents.image("depth", "depth_crc32", range(self._count)[index])
+        image = self.contents.image("depth", range(self._count)[index])
         return image.astype(np.float32) * np.float32(1e-3)
 
     @cached_property

@@ -20,6 +20,7 @@ _CHECKS = (
     content.check_frame_columns,
     content.check_ledger,
     content.check_pixels,
+    content.check_depth,
     content.check_robot,
     content.check_clocks,
     annotation.check_calibration,

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from dataset.errors import CalibrationError
 from dataset.intrinsics import Intrinsics
-from dataset.session.files import READ_ERRORS, attribute
+from dataset.session.files import attribute
 from dataset.session.records import ObjectRecord, mask_box
+from dataset.validate.images import intact_images
 from dataset.validate.problems import Problem, View, first_frames
 
 _ORTHONORMAL = 1e-4
@@ -73,8 +74,10 @@ def check_poses(view: View) -> Iterator[Problem]:
     yield from _check_rigid(view, "poses/T_base_cam")
     for name in ("sigma_t", "sigma_r"):
         values = view.read(f"poses/{name}")
-        if values is not None and (wrong := values < 0).any():
-            yield Problem(f"poses/{name}", f"is negative at frame {first_frames(wrong)}", _ANNOTATE)
+        if values is not None and (wrong := (values < 0) | np.isinf(values)).any():
+            yield Problem(
+                f"poses/{name}", f"is negative or infinite at frame {first_frames(wrong)}", _ANNOTATE
+            )
     for name in view.names("poses/objects"):
         if f"objects/{name}" not in view.file:
             yield Problem(f"poses/objects/{name}", f"there is no mesh objects/{name}", "store the mesh")
@@ -124,21 +127,17 @@ def _check_rigid(view: View, path: str) -> Iterator[Problem]:
 
 def _check_masks(view: View, where: str) -> Iterator[Problem]:
     fraction, boxes = view.read(f"{where}/visible_fraction"), view.read(f"{where}/bbox_xywh")
-    masks = view.dataset(f"{where}/mask")
     if fraction is not None and (wrong := ~((fraction >= 0) & (fraction <= 1))).any():
         what = f"is not within 0 and 1 at frame {first_frames(wrong)}"
         yield Problem(f"{where}/visible_fraction", what, _ANNOTATE)
-    if masks is None or boxes is None:
-        return
-    for index in range(min(len(masks), len(boxes))):
-        try:
-            mask = masks[index]
-        except READ_ERRORS as error:
-            yield Problem(f"{where}/mask[{index}]", f"cannot be decompressed ({error})", _ANNOTATE)
-            continue
+    problems: list[Problem] = []
+    for index, mask in intact_images(view, f"{where}/mask", _ANNOTATE, problems):
         if mask.max() > 1:
-            yield Problem(f"{where}/mask[{index}]", "holds values other than 0 and 1", _ANNOTATE)
+            problems.append(Problem(f"{where}/mask[{index}]", "holds values other than 0 and 1", _ANNOTATE))
+        if boxes is None or index >= len(boxes):
+            continue
         expected = mask_box(mask)
         if mask.any() and not np.abs(boxes[index] - expected).max() <= _BOX_TOLERANCE_PX:
             what = f"{np.round(boxes[index], 2).tolist()} is not the box {expected.tolist()} of the mask"
-            yield Problem(f"{where}/bbox_xywh[{index}]", what, _ANNOTATE)
+            problems.append(Problem(f"{where}/bbox_xywh[{index}]", what, _ANNOTATE))
+    yield from problems

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dataset.compression import checksum
 from dataset.polarimetry import white_level
 from dataset.schema import FRAME_COLUMNS
 from dataset.session.accounting import unexplained
-from dataset.session.files import READ_ERRORS, attribute
+from dataset.session.files import attribute
+from dataset.validate.images import intact_images
 from dataset.validate.problems import Problem, View, first_frames
 
 _CLOCK_RATE_TOLERANCE = 1e-3
@@ -80,25 +81,25 @@ def check_ledger(view: View) -> Iterator[Problem]:
         )
 
 
-def check_pixels(view: View) -> Iterator[Problem]:
+def check_pixels(view: View) -> list[Problem]:
     """Every frame decompresses to the pixels it was stored with, within the camera's bits."""
-    raw, checksums = view.dataset("camera/raw"), view.read("camera/crc32")
-    if raw is None or checksums is None:
-        return
+    problems: list[Problem] = []
     bits = attribute(view.file["camera"], "bits")
     white = white_level(bits) if isinstance(bits, int) and 0 < bits <= 16 else None
     hint = f"copy the file again from its source, or run: s2p3 dataset repair {view.path}"
-    for index in range(min(len(raw), len(checksums))):
-        try:
-            pixels = raw[index]
-        except READ_ERRORS as error:
-            yield Problem(f"camera/raw[{index}]", f"cannot be decompressed ({error})", hint)
-            continue
-        if checksum(pixels) != int(checksums[index]):
-            yield Problem(f"camera/raw[{index}]", "the pixels do not match their checksum", hint)
-        elif white is not None and int(pixels.max()) > white:
+    for index, pixels in intact_images(view, "camera/raw", hint, problems):
+        if white is not None and int(pixels.max()) > white:
             what = f"holds the value {int(pixels.max())}, more than {bits} bits"
-            yield Problem(f"camera/raw[{index}]", what, "check the camera's bits and pixel format")
+            hint_bits = "check the camera's bits and pixel format"
+            problems.append(Problem(f"camera/raw[{index}]", what, hint_bits))
+    return problems
+
+
+def check_depth(view: View) -> list[Problem]:
+    """Every depth image decompresses to the pixels it was stored with."""
+    problems: list[Problem] = []
+    deque(intact_images(view, "depth", "copy the file again from its source", problems), maxlen=0)
+    return problems
 
 
 def check_robot(view: View) -> Iterator[Problem]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -51,6 +51,16 @@ class RepairResult:
     damaged_ids: tuple[int, ...]
     lost: tuple[str, ...]
 
+    def __str__(self) -> str:
+        if not self.changed:
+            return f"{self.path}: nothing to repair, {self.frames} frames"
+        text = f"{self.path}: repaired, {self.frames} frames"
+        if self.damaged_ids:
+            text += (
+                f"; {len(self.damaged_ids)} damaged ones are in the ledger now: {_first(self.damaged_ids)}"
+            )
+        return text + (f"; lost: {_first(self.lost)}" if self.lost else "")
+
 
 def repair(path: str | Path, on_progress: Progress = lambda done, total: None) -> RepairResult:
     """Restores every frame that had reached the disk and marks the session complete.
@@ -93,6 +103,11 @@ def repair(path: str | Path, on_progress: Progress = lambda done, total: None) -
     finally:
         copy.unlink(missing_ok=True)
     return RepairResult(path, True, len(keep), ids, lost)
+
+
+def _first(names: Sequence[object]) -> str:
+    shown = ", ".join(map(str, names[:8]))
+    return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
 
 
 @contextmanager

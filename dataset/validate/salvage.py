@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataset.compression import compress
-from dataset.schema import DATASETS, DROP_DTYPE, ROBOT_COLUMNS, TABLES, Dataset, declaration, declared_at
+from dataset.schema import (
+    DATASETS,
+    DROP_DTYPE,
+    ROBOT_COLUMNS,
+    TABLES,
+    Dataset,
+    checksums_of,
+    declaration,
+    declared_at,
+)
 from dataset.session.files import READ_ERRORS, make_dataset
 from dataset.session.seals import SEAL, intact
 
@@ -46,7 +55,7 @@ def copy_content(
             if path == "camera/drops":
                 _copy_drops(source, target, gone, reason)
             elif declared is not None and declared.compressed:
-                _copy_images(node, target, declared, path, keep)
+                lost += _copy_images(source, target, declared, path, keep)
             elif declared is not None:
                 data = _rows(node, declared, keep, samples)
                 copied = make_dataset(target, declared, path, data, data.shape, node.dtype)
@@ -100,10 +109,21 @@ def _rows(node: h5py.Dataset, declared: Dataset, keep: Indices, samples: int) ->
     return np.asarray(node[()], dtype=node.dtype)
 
 
-def _copy_images(node: h5py.Dataset, target: h5py.File, declared: Dataset, path: str, keep: Indices) -> None:
+def _copy_images(
+    source: h5py.File, target: h5py.File, declared: Dataset, path: str, keep: Indices
+) -> list[str]:
+    """Copies the images that can be read and returns the paths of the others, whose checksums, copied too,
+    go on to say that they are damaged."""
+    node, lost = source[path], []
     stored = make_dataset(target, declared, path, None, (len(keep), *node.shape[1:]), node.dtype)
     for row, index in enumerate(keep):
-        stored.id.write_direct_chunk((row, 0, 0), compress(node[int(index)]).data)
+        try:
+            stored.id.write_direct_chunk((row, 0, 0), compress(node[int(index)]).data)
+        except READ_ERRORS:
+            if checksums_of(path) not in source:
+                raise
+            lost.append(f"{path}[{index}]")
+    return lost
 
 
 def _copy_drops(source: h5py.File, target: h5py.File, gone: Indices, reason: bytes) -> None:

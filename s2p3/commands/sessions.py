@@ -90,7 +90,9 @@ def repair(session: tyro.conf.Positional[Path]) -> None:
     """
     from dataset.validate import repair as restore
 
-    say(str(restore(session)))
+    with counting("repair") as report:
+        done = restore(session, report)
+    say(str(done))
 
 
 def split(

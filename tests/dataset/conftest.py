@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dataset import SE3, CameraInfo, ClockFit, Intrinsics, RawFrame, RobotTrace
 from dataset.session import (
@@ -20,6 +21,7 @@ from dataset.session import (
     write_poses,
     write_split,
 )
+from dataset.session.edit import write_depth
 
 HEIGHT, WIDTH, FRAMES = 32, 48, 12
 
@@ -100,6 +102,16 @@ def poses() -> tuple[SE3, ObjectPoses]:
     return T_base_cam, ObjectPoses(T_base_cam.inverse(), np.full(FRAMES, 0.9), boxes, masks)
 
 
+def depth(count: int) -> NDArray[np.uint16]:
+    """Depth of so many frames, millimetres."""
+    return np.random.default_rng(5).integers(0, 900, (count, HEIGHT // 4, WIDTH // 4)).astype(np.uint16)
+
+
+@pytest.fixture
+def make_depth() -> Callable[[int], NDArray[np.uint16]]:
+    return depth
+
+
 @pytest.fixture(scope="session")
 def master(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A complete, calibrated, annotated session without a problem."""
@@ -115,6 +127,7 @@ def master(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_object(path, TETRAHEDRON)
     T_base_cam, object_poses = poses()
     write_poses(path, T_base_cam, 1e-4, np.full(FRAMES, 2e-4), {"tetra": object_poses})
+    write_depth(path, depth(FRAMES))
     write_split(path, "train", np.arange(9))
     write_split(path, "test", [9, 11, 10])
     return path

@@ -16,7 +16,6 @@ from dataset import SE3, Intrinsics, SessionError, ToolkitError
 from dataset.bop import export_bop, import_bop
 from dataset.bop.layout import decode_stokes, encode_stokes, read_image
 from dataset.session import ObjectRecord, Session
-from dataset.session.edit import write_depth
 from dataset.validate import validate
 
 
@@ -31,8 +30,6 @@ def draw(record: ObjectRecord, T_cam_obj: SE3, camera: Intrinsics) -> NDArray[np
 
 @pytest.fixture
 def exported(recorded: Path, tmp_path: Path) -> Path:
-    depth = np.random.default_rng(0).integers(0, 900, (12, 8, 12)).astype(np.uint16)
-    write_depth(recorded, depth)
     return export_bop([recorded], tmp_path / "bop", draw, "test", "test")
 
 

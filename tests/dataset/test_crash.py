@@ -199,6 +199,8 @@ def test_damaged_frames_move_to_the_ledger(recorded: Path, make_frame: Callable[
     result = repair(recorded)
     assert result.frames == 10
     assert result.damaged_ids == (2, 10)
+    assert str(result) == f"{recorded}: repaired, 10 frames; 2 damaged ones are in the ledger now: 2, 10"
+    assert str(repair(recorded)) == f"{recorded}: nothing to repair, 10 frames"
     with Session.open(recorded) as session:
         assert session.frame_ids.tolist() == [0, 1, 3, 4, 5, 7, 8, 9, 11, 12]
         assert sorted(session.drops["frame_id"].tolist()) == [2, 6, 10]
@@ -210,6 +212,24 @@ def test_damaged_frames_move_to_the_ledger(recorded: Path, make_frame: Callable[
         assert session.splits["train"].tolist() == list(range(8))
         assert session.splits["test"].tolist() == [8, 9]
     assert validate(recorded) == []
+
+
+def test_a_damaged_mask_costs_no_other(recorded: Path) -> None:
+    with h5py.File(recorded, "r+") as file:
+        file["poses/objects/tetra/mask"].id.write_direct_chunk((4, 0, 0), b"\1" * 40)
+        file["depth"].id.write_direct_chunk((6, 0, 0), b"\1" * 40)
+        file["camera/raw"].id.write_direct_chunk((2, 0, 0), b"\1" * 64)
+    result = repair(recorded)
+    assert result.lost == ("depth[6]", "poses/objects/tetra/mask[4]")
+    assert str(result).endswith("lost: depth[6], poses/objects/tetra/mask[4]")
+    with Session.open(recorded) as session:
+        poses = session.object_poses("tetra")
+        for index in (i for i in range(11) if i != 3):
+            assert poses.mask(index).sum() == 16
+        for read in (lambda: poses.mask(3), lambda: session.depth(5)):
+            with pytest.raises(SessionError, match="damaged"):
+                read()
+    assert [problem.where for problem in validate(recorded)] == ["depth[5]", "poses/objects/tetra/mask[3]"]
 
 
 def test_an_interrupted_repair_leaves_the_original(recorded: Path) -> None:

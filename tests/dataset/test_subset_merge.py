@@ -10,10 +10,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dataset import CameraInfo, ClockFit, Intrinsics, RawFrame, RobotTrace, SessionError
 from dataset.merge import merge
 from dataset.session import ObjectRecord, Session, SessionWriter, write_calibration, write_object
+from dataset.session.edit import write_depth
 from dataset.subset import chosen_frames, subset
 from dataset.validate import validate
 
@@ -156,11 +158,15 @@ def test_poses_of_one_part_are_unknown_in_the_other(
     intrinsics: Intrinsics,
     tmp_path: Path,
     make_frame: Callable[..., RawFrame],
+    make_depth: Callable[[int], NDArray[np.uint16]],
 ) -> None:
     bare, out = tmp_path / "bare.h5", tmp_path / "both.h5"
     with SessionWriter(bare, "sequence", camera) as writer:
         writer.add_frame(make_frame(50))
     write_calibration(bare, '{"fx": 40}', intrinsics)
+    with pytest.raises(SessionError, match="only one of them has depth"):
+        merge([recorded, bare], out, forget_clocks=True)
+    write_depth(bare, make_depth(1))
     assert merge([recorded, bare], out, forget_clocks=True) == 13
     assert validate(out) == []
     with Session.open(out) as both, Session.open(recorded) as whole:

@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dataset import CameraInfo, Intrinsics, RawFrame
 from dataset.schema import VERSION
@@ -37,6 +38,13 @@ def test_intrinsics_known_from_the_start_need_no_calibration_file(
 
 def spoil(file: h5py.File, path: str, index: object, value: object) -> None:
     file[path][index] = value
+
+
+def dented(file: h5py.File) -> NDArray[np.uint8]:
+    """The mask of frame 3 without one of its inner pixels: its box is the same."""
+    mask: NDArray[np.uint8] = file["poses/objects/tetra/mask"][3]
+    mask[3, 4] = 0
+    return mask
 
 
 DAMAGES: dict[str, tuple[Callable[[h5py.File], None], str, str]] = {
@@ -95,6 +103,26 @@ DAMAGES: dict[str, tuple[Callable[[h5py.File], None], str, str]] = {
         "camera/raw[4]",
         "do not match their checksum",
     ),
+    "flipped mask": (
+        lambda f: f["poses/objects/tetra/mask"].id.write_direct_chunk((3, 0, 0), compress(dented(f)).data),
+        "poses/objects/tetra/mask[3]",
+        "do not match their checksum",
+    ),
+    "broken mask": (
+        lambda f: f["poses/objects/tetra/mask"].id.write_direct_chunk((3, 0, 0), b"\0" * 40),
+        "poses/objects/tetra/mask[3]",
+        "cannot be decompressed",
+    ),
+    "broken depth": (
+        lambda f: f["depth"].id.write_direct_chunk((3, 0, 0), b"\0" * 40),
+        "depth[3]",
+        "cannot be decompressed",
+    ),
+    "flipped depth": (
+        lambda f: f["depth"].id.write_direct_chunk((3, 0, 0), compress(f["depth"][3] ^ 1).data),
+        "depth[3]",
+        "do not match their checksum",
+    ),
     "broken chunk": (
         lambda f: f["camera/raw"].id.write_direct_chunk((4, 0, 0), b"\0" * 40),
         "camera/raw[4]",
@@ -146,7 +174,7 @@ DAMAGES: dict[str, tuple[Callable[[h5py.File], None], str, str]] = {
         "poses/T_base_cam",
         "last row",
     ),
-    "sigma": (lambda f: spoil(f, "poses/sigma_r", 1, -1), "poses/sigma_r", "negative at frame 1"),
+    "sigma": (lambda f: spoil(f, "poses/sigma_r", 1, -1), "poses/sigma_r", "negative or infinite at frame 1"),
     "visibility": (
         lambda f: spoil(f, "poses/objects/tetra/visible_fraction", 1, 1.5),
         "poses/objects/tetra/visible_fraction",

@@ -15,7 +15,7 @@ from typing import Literal
 from acquisition import typed_toml
 from dataset.errors import ToolkitError
 
-PhysicsVariant = Literal["dolp", "stokes", "none"]
+PhysicsVariant = Literal["dolp", "stokes", "aolp", "dolp-gain", "none"]
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,8 @@ class SelfSupervisionConfig:
     normals_weight: float = 2.0
     physics_weight: float = 2.0
     physics: PhysicsVariant = "dolp"
-    """`dolp` (the paper's L_physics), `stokes` (DoLP and AoLP, our extension), or `none`."""
+    """`dolp` (the paper's L_physics), `none`, or one of our extensions: `stokes` (DoLP and AoLP), `aolp`,
+    `dolp-gain` (DoLP, specular reflection diluted by a factor fitted to each image)."""
     smoothing: int = 3
     """Side of the box over which Stokes values are averaged before L_physics: less noise bias; 1 for thin
     objects."""

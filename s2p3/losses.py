@@ -1,11 +1,13 @@
-"""The losses: the paper's, by equation, and the ones we added for pre-training.
+"""The losses: the paper's, by equation, and the ones we added.
 
-Equation numbers are the S2P3 paper's: (7) L_pseudo, (8) L_pose, (9) L_geo, (10) L_physics, (11) the total.
-Every function returns one value per sample (B,), so that weights and the delta rule can be applied sample by
-sample.
+Equation numbers are the S2P3 paper's: (7) L_pseudo, (8) L_pose, (9) L_geo, (10) L_physics, (11) the total,
+(12) L_chamfer. Every function returns one value per sample (B,), so that weights and the delta rule can be
+applied sample by sample. An average over no pixel at all is zero.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +17,7 @@ from s2p3 import physics
 from s2p3.config import PhysicsVariant
 
 _FLOOR = 1e-3  # of S0
+_GAIN = (0.3, 1.0)  # range of the fitted dilution: below it a wrong pose could silence the loss
 
 
 def transform(points: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
@@ -45,8 +48,8 @@ def pose_loss(
 
 
 def rotation_loss(points: Tensor, rotation: Tensor, target: Tensor, symmetries: Tensor) -> Tensor:
-    """Point matching for the rotation alone, as in the paper's pre-training: mean L1 distance, metres;
-    arguments as `pose_loss`."""
+    """Point matching for the rotation alone, Eq. (8) without translations, as in the paper's pre-training:
+    mean L1 distance, metres; arguments as `pose_loss`."""
     zero = torch.zeros_like(rotation[:, 0])
     return pose_loss(points, rotation, zero, target, zero, symmetries)
 
@@ -80,7 +83,7 @@ def dense_loss(
     normals, both averaged over the visible object. All maps (B, C, h, w).
     """
     inside = (mask > 0.5).to(mask.dtype)
-    area = inside.sum((1, 2, 3)) + 1
+    area = inside.sum((1, 2, 3)).clamp_min(1)
     mask_error = F.binary_cross_entropy_with_logits(mask_logits, mask, reduction="none").mean((1, 2, 3))
     coordinate_error = ((coordinates - true_coordinates).abs() * inside).sum((1, 2, 3)) / area
     cosine = (normals * true_normals).sum(1, keepdim=True)
@@ -89,8 +92,8 @@ def dense_loss(
 
 
 def discrepancy(predicted_mask: Tensor, rendered_mask: Tensor) -> Tensor:
-    """delta: how far the teacher's predicted mask is from the one rendered at its pose, 0 (equal) to 1
-    (disjoint).
+    """delta of the delta rule: how far the teacher's predicted mask is from the one rendered at its pose, 0
+    (equal) to 1 (disjoint).
 
     The paper normalizes the discrepancy to a scalar without saying how; ours is sum |a - b| / sum max(a, b).
     (B, 1, h, w).
@@ -100,9 +103,15 @@ def discrepancy(predicted_mask: Tensor, rendered_mask: Tensor) -> Tensor:
     return (difference / union.clamp_min(1e-3)).clamp(0, 1)
 
 
+def pose_weight(delta: Tensor) -> Tensor:
+    """lambda_1 of Eq. (7): 1 - delta (B,). The paper reduces the weight "also" where the predicted maps are
+    chosen; that it applies on both sides of the threshold is our reading."""
+    return 1 - delta
+
+
 def pseudo_maps(delta: Tensor, threshold: float, rendered: Tensor, predicted: Tensor) -> Tensor:
-    """The delta rule: the teacher's rendered map where delta <= r, the predicted one elsewhere. Maps (B, C,
-    h, w)."""
+    """The delta rule below Eq. (9): the teacher's rendered map where delta <= r, the predicted one elsewhere.
+    Maps (B, C, h, w)."""
     use_rendered = (delta <= threshold)[:, None, None, None]
     return torch.where(use_rendered, rendered, predicted)
 
@@ -117,7 +126,7 @@ def normals_loss(normals: Tensor, target: Tensor, mask: Tensor, target_mask: Ten
     3, h, w)."""
     both = ((mask.detach() > 0.3) & (target_mask > 0.5)).to(normals.dtype)
     cosine = (normals * target).sum(1, keepdim=True)
-    return ((1 - cosine) * both).sum((1, 2, 3)) / (both.sum((1, 2, 3)) + 1)
+    return _average((1 - cosine)[:, 0], both[:, 0])
 
 
 def physics_loss(
@@ -132,28 +141,133 @@ def physics_loss(
     averaged over `mask`.
 
     Args:
-        variant: "dolp", the paper's: |rho - rho_hat|; "stokes", our extension: L1 distance of (S1, S2) / S0,
-            which the angle of polarization enters too.
+        variant: what is compared, per pixel. "dolp", the paper's: |rho - rho_hat|. The others are ours.
+            "stokes": the L1 distance of (S1, S2) / S0, which the angle of polarization enters too. "aolp":
+            rho (1 - |cos 2(phi - alpha)|), the angle alone, as far as there is polarization. "dolp-gain":
+            |rho - rho_hat| with rho_hat_s scaled by one factor an image, fitted to it, because diffuse light
+            dilutes specular polarization.
         stokes: (B, 3, h, w) measured.
         normals: (B, 3, h, w) rendered at the student's pose, unit inside `mask`, camera frame.
         rays: (B, 3, h, w) unit viewing rays.
         mask: (B, 1, h, w), 0 or 1.
         refractive_index: of the object.
     """
-    s0, s1, s2 = stokes.unbind(1)
-    s0 = s0.clamp_min(_FLOOR)
-    diffuse, specular = physics.analytic_dolp(normals, rays, refractive_index)
-    if variant == "dolp":
-        dolp = (torch.hypot(s1, s2) / s0).clamp(max=1)
-        error = torch.minimum((dolp - diffuse).abs(), (dolp - specular).abs())
-    else:
-        measured = torch.stack([s1 / s0, s2 / s0], dim=1)
-        direction = physics.doubled_azimuth(normals, rays)
-        to_diffuse = (measured - diffuse[:, None] * direction).abs().sum(1)
-        to_specular = (measured + specular[:, None] * direction).abs().sum(1)
-        error = torch.minimum(to_diffuse, to_specular)
+    if variant == "none":
+        return stokes.new_zeros(len(stokes))
     weight = mask[:, 0]
-    return (error * weight).sum((1, 2)) / (weight.sum((1, 2)) + 1)
+    error = _PHYSICS[variant](stokes, normals, rays, weight, refractive_index)
+    return _average(error, weight)
+
+
+def depth_loss(depth: Tensor, measured: Tensor, mask: Tensor) -> Tensor:
+    """The pixel-wise loss of the depth ablation: mean L1 distance, metres, over the pixels of `mask` in which
+    both know the depth.
+
+    Args:
+        depth: (B, 1, h, w) rendered at the student's pose; 0 outside the object.
+        measured: (B, 1, h, w); 0: unknown.
+        mask: (B, 1, h, w), 0 or 1.
+    """
+    known = mask * (measured > 0) * (depth.detach() > 0)
+    return _average((depth - measured).abs()[:, 0], known[:, 0])
+
+
+def chamfer_loss(points: Tensor, others: Tensor, limit_m: float = float("inf")) -> Tensor:
+    """L_chamfer, Eq. (12): mean distance from every point to the nearest of the other set, and the same the
+    other way round, metres.
+
+    Args:
+        points: (B, P, 3), one of the sets, NaN rows are not there.
+        others: (B, Q, 3), the other.
+        limit_m: pairs further apart than this do not count (Self6D++; none in the paper).
+
+    A set of no points gives zero.
+    """
+    there, others_there = points.isfinite().all(-1), others.isfinite().all(-1)
+    # NaNs are replaced before the distances, or their gradients would be NaN, too
+    points = torch.where(there[..., None], points, 0.0)
+    others = torch.where(others_there[..., None], others, 0.0)
+    difference = points[:, :, None] - others[:, None]
+    distances = difference.square().sum(-1).clamp_min(1e-16).sqrt()
+    pair = there[:, :, None] & others_there[:, None]
+    distances = torch.where(pair, distances, float("inf"))
+    total = points.new_zeros(len(points))
+    for dim in (2, 1):
+        nearest = distances.amin(dim)
+        counts = nearest < limit_m
+        total = total + _average(torch.where(counts, nearest, 0.0), counts.to(nearest.dtype))
+    return total
+
+
+def back_project(depth: Tensor, mask: Tensor, K: Tensor, count: int) -> Tensor:
+    """At most `count` points (B, count, 3) of a depth map, camera frame, metres, spread evenly over the
+    pixels of `mask` in which it is known; NaN rows fill up.
+
+    Args:
+        depth: (B, 1, h, w); 0: unknown.
+        mask: (B, 1, h, w).
+        K: (B, 3, 3) of these pixels.
+    """
+    height, width = depth.shape[2:]
+    rays = physics.pixel_rays(K, height, width)
+    cloud = (rays / rays[:, 2:] * depth).flatten(2).transpose(1, 2)
+    rows = []
+    for points, known in zip(cloud, ((mask > 0.5) & (depth > 0)).flatten(1), strict=True):
+        where = torch.nonzero(known)[:, 0]
+        chosen = where[torch.linspace(0, max(len(where) - 1, 0), min(count, len(where))).long()]
+        rows.append(F.pad(points[chosen], (0, 0, 0, count - len(chosen)), value=float("nan")))
+    return torch.stack(rows)
+
+
+def _dolp(stokes: Tensor) -> Tensor:
+    s0, s1, s2 = stokes.unbind(1)
+    return (torch.hypot(s1, s2) / s0.clamp_min(_FLOOR)).clamp(max=1)
+
+
+def _dolp_error(stokes: Tensor, normals: Tensor, rays: Tensor, weight: Tensor, index: float) -> Tensor:
+    del weight
+    dolp = _dolp(stokes)
+    diffuse, specular = physics.analytic_dolp(normals, rays, index)
+    return torch.minimum((dolp - diffuse).abs(), (dolp - specular).abs())
+
+
+def _gain_error(stokes: Tensor, normals: Tensor, rays: Tensor, weight: Tensor, index: float) -> Tensor:
+    dolp = _dolp(stokes)
+    diffuse, specular = physics.analytic_dolp(normals, rays, index)
+    fitted = (dolp * specular * weight).sum((1, 2)) / (specular.square() * weight).sum((1, 2)).clamp_min(1e-6)
+    gain = fitted.clamp(*_GAIN).detach()[:, None, None]  # detached: the pose must not explain itself away
+    return torch.minimum((dolp - diffuse).abs(), (dolp - gain * specular).abs())
+
+
+def _stokes_error(stokes: Tensor, normals: Tensor, rays: Tensor, weight: Tensor, index: float) -> Tensor:
+    del weight
+    measured = stokes[:, 1:] / stokes[:, :1].clamp_min(_FLOOR)
+    diffuse, specular = physics.analytic_dolp(normals, rays, index)
+    direction = physics.doubled_azimuth(normals, rays)
+    to_diffuse = (measured - diffuse[:, None] * direction).abs().sum(1)
+    to_specular = (measured + specular[:, None] * direction).abs().sum(1)
+    return torch.minimum(to_diffuse, to_specular)
+
+
+def _aolp_error(stokes: Tensor, normals: Tensor, rays: Tensor, weight: Tensor, index: float) -> Tensor:
+    del weight, index
+    measured = stokes[:, 1:] / stokes[:, :1].clamp_min(_FLOOR)
+    along = (measured * physics.doubled_azimuth(normals, rays)).sum(1)
+    return measured.norm(dim=1) - along.abs()  # diffuse along the azimuth, specular across: the nearer counts
+
+
+_PHYSICS: dict[PhysicsVariant, Callable[[Tensor, Tensor, Tensor, Tensor, float], Tensor]] = {
+    "dolp": _dolp_error,
+    "stokes": _stokes_error,
+    "aolp": _aolp_error,
+    "dolp-gain": _gain_error,
+}
+
+
+def _average(values: Tensor, weight: Tensor) -> Tensor:
+    """Mean (B,) of (B, ...) by weights of 0 and 1; zero where nothing counts."""
+    inner = tuple(range(1, values.dim()))
+    return (values * weight).sum(inner) / weight.sum(inner).clamp_min(1)
 
 
 def _symmetric_targets(points: Tensor, rotation: Tensor, symmetries: Tensor) -> Tensor:

@@ -120,7 +120,7 @@ class _Objective:
         distance = losses.pose_loss(self.points, rotation, translation, *pose, self.symmetries)
         settings = self.settings
         terms = {
-            "pose": ((1 - target.delta) * distance).mean() / self.model.diameter,
+            "pose": (losses.pose_weight(target.delta) * distance).mean() / self.model.diameter,
             "mask": losses.mask_loss(mask, target_mask).mean(),
             "normals": losses.normals_loss(normals, target_normals, mask, target_mask).mean(),
         }

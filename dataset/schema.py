@@ -1,4 +1,4 @@
-"""The declaration of session.h5, schema 1.0. The writer, the reader, the validator and the docs read it.
+"""The declaration of session.h5. The writer, the reader, the validator and the docs read it.
 
 One HDF5 file per recording. Shapes use these letters: N frames, H x W the raw mosaic, h x w the polarization
 image at one pixel per super-pixel, M robot samples, D ledgered drops, V vertices, F faces, n and k any count.
@@ -39,7 +39,8 @@ TABLES = {"drop": DROP_DTYPE, "pause": PAUSE_DTYPE, "segment": SEGMENT_DTYPE}
 
 @dataclass(frozen=True)
 class Attribute:
-    """An HDF5 attribute: the group it sits on, its name and Python type, and what it may hold."""
+    """An HDF5 attribute: the group it sits on, its name and Python type, what it may hold, and the minor
+    version that brought it."""
 
     group: str
     name: str
@@ -47,6 +48,7 @@ class Attribute:
     description: str
     choices: tuple[str, ...] = ()
     required: bool = True
+    since: int = 0
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class Dataset:
         chunk: rows per HDF5 chunk of a dataset that grows frame by frame or sample by sample; 0 otherwise.
         compressed: whether chunks pass the Blosc2 filter (LZ4, bit shuffle): one chunk an image, with its
             checksum in the dataset named by `checksums_of`. All others carry the attribute `crc32`.
+        since: the minor version that brought it; what 0 declared stays, later ones only add.
     """
 
     path: str
@@ -73,6 +76,7 @@ class Dataset:
     required: bool = True
     chunk: int = 0
     compressed: bool = False
+    since: int = 0
 
 
 ATTRIBUTES: tuple[Attribute, ...] = (
@@ -89,11 +93,17 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         str,
         "Which start of the recording computer its clock counts from",
         required=False,
+        since=1,
     ),
     Attribute("/", "complete", bool, "Whether the recording ended as intended"),
     Attribute("/", "repaired", str, "When and what a repair restored", required=False),
     Attribute(
-        "/", "origin", str, "What the file was made from, where it is no recording of its own", required=False
+        "/",
+        "origin",
+        str,
+        "What the file was made from, where it is no recording of its own",
+        required=False,
+        since=1,
     ),
     Attribute("/camera", "vendor", str, "Camera vendor"),
     Attribute("/camera", "model", str, "Camera model"),
@@ -106,7 +116,13 @@ ATTRIBUTES: tuple[Attribute, ...] = (
     Attribute("/camera", "bits", int, "Significant bits of a raw value"),
     Attribute("/camera", "packet_size", int, "GigE Vision packet size, bytes; 0 where there is none"),
     Attribute(
-        "/camera", "clock", str, "Whose clock the camera time is on", ("camera", "host"), required=False
+        "/camera",
+        "clock",
+        str,
+        "Whose clock the camera time is on",
+        ("camera", "host"),
+        required=False,
+        since=1,
     ),
     Attribute("/objects/*", "material", str, "Material name"),
     Attribute("/objects/*", "refractive_index", float, "Real part of the refractive index"),
@@ -161,6 +177,7 @@ DATASETS: tuple[Dataset, ...] = (
         "Gaps that were asked for; their frames count neither as stored nor as lost",
         required=False,
         chunk=64,
+        since=1,
     ),
     Dataset(
         "robot/host_time_ns", ("i8",), ("M",), "ns", "Sample first seen, host monotonic clock", chunk=1024
@@ -185,6 +202,7 @@ DATASETS: tuple[Dataset, ...] = (
         "kg, m",
         "What the arm reckoned with: mass, and its centre in the flange frame; NaN: not told",
         required=False,
+        since=1,
     ),
     Dataset(
         "clocks/camera", ("f8",), (3,), "ns, 1, ns", "a, b, sigma of host = a + b camera; NaN: see pieces"
@@ -198,6 +216,7 @@ DATASETS: tuple[Dataset, ...] = (
         "Row of the first frame of each piece, then its a, b, sigma of host = a + b camera",
         required=False,
         chunk=64,
+        since=1,
     ),
     Dataset(
         "clocks/robot_pieces",
@@ -207,6 +226,7 @@ DATASETS: tuple[Dataset, ...] = (
         "Row of the first sample of each piece, then its a, b, sigma of host = a + b robot",
         required=False,
         chunk=64,
+        since=1,
     ),
     Dataset(
         "segments",
@@ -216,6 +236,7 @@ DATASETS: tuple[Dataset, ...] = (
         "Uninterrupted recordings that the file is made of; one, unless more was appended",
         required=False,
         chunk=64,
+        since=1,
     ),
     Dataset(
         "depth",
@@ -228,7 +249,13 @@ DATASETS: tuple[Dataset, ...] = (
         compressed=True,
     ),
     Dataset(
-        "depth_crc32", ("u4",), ("N",), "1", "CRC-32 of the depth image's bytes, row by row", required=False
+        "depth_crc32",
+        ("u4",),
+        ("N",),
+        "1",
+        "CRC-32 of the depth image's bytes, row by row",
+        required=False,
+        since=1,
     ),
     Dataset(
         "polarizer/angle",
@@ -238,6 +265,7 @@ DATASETS: tuple[Dataset, ...] = (
         "Dial of the polarizer before the lens, counter-clockwise as the image shows it; NaN: unknown",
         required=False,
         chunk=1024,
+        since=1,
     ),
     Dataset("calibration/json", ("text",), (), "1", "calibration.json as it was applied", required=False),
     Dataset("calibration/K", ("f8",), (3, 3), "px", "Pinhole matrix at the mosaic's grid", required=False),
@@ -251,6 +279,7 @@ DATASETS: tuple[Dataset, ...] = (
         "1",
         "Analysis vector a of every pixel, which reads a . (S0, S1, S2)",
         required=False,
+        since=1,
     ),
     Dataset("objects/*/vertices", ("f8",), ("V", 3), "m", "Mesh vertices in the object frame"),
     Dataset("objects/*/faces", ("i4",), ("F", 3), "1", "Vertex indices, counter-clockwise seen from outside"),
@@ -289,8 +318,9 @@ DATASETS: tuple[Dataset, ...] = (
         ("u4",),
         ("N",),
         "1",
-        "CRC-32 of the mask's bytes, row by row; schema 1.0 had none",
+        "CRC-32 of the mask's bytes, row by row",
         required=False,
+        since=1,
     ),
     Dataset("splits/*", ("i8",), ("k",), "1", "Frame indices of a split, increasing", required=False),
 )

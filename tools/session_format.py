@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from dataset.schema import ATTRIBUTES, DATASETS, DROP_DTYPE, FORMAT, KINDS, VERSION, Attribute, Dataset
+from dataset.schema import ATTRIBUTES, DATASETS, FORMAT, KINDS, MAJOR, TABLES, VERSION, Attribute, Dataset
 
 PAGE = Path(__file__).parents[1] / "docs" / "session-format.md"
 
@@ -52,9 +52,8 @@ with Session.open("sequence.h5") as session:
   beside them (`camera/crc32`, `depth_crc32`, `mask_crc32`); every other dataset has that of its bytes as its
   attribute `crc32` (-1 while it is being written), a group that of the attributes named in `crc32_of`, as a
   JSON object with sorted names.
-- A file of this major version always opens, whatever its minor version: a later minor version only adds, and
-  what a reader does not know it leaves alone. A new major version comes with a converter
-  (`s2p3 dataset convert`); a toolkit older than the file says so.
+- A file of this major version always opens, whatever its minor version. A new major version comes with a
+  converter (`s2p3 dataset convert`); a toolkit older than the file says so.
 
 Kinds: {", ".join(f"`{kind}`" for kind in KINDS)}.
 
@@ -66,11 +65,27 @@ coordinates; boxes are in pixel-edge coordinates. Everything derived (boxes, mas
 for monochrome ones.
 
 Letters in shapes: N frames, H x W the raw mosaic, h x w the undistorted polarization image, M robot samples,
-D drops, V vertices, F faces, n and k any count. A `*` stands for a name that the user chose. A row of the
-ledger of drops holds {", ".join(f"`{name}`" for name, _ in DROP_DTYPE)}.
+D drops, V vertices, F faces, n and k any count. A `*` stands for a name that the user chose.
+
+## Minor versions
+What 1.0 declared is frozen: as long as the major version is 1 it keeps its name, type, shape and unit. A
+later minor version only adds, never as a requirement, and a reader leaves alone what it does not know; so an
+older toolkit reads a newer file, and a newer one an older file.
+
+1.1 added what is marked *since 1.1* below; the checksums of everything but the mosaics; the kind `touches`;
+"unknown" (-1, NaN) for times, exposure and gain that nobody measured; and clocks in several pieces, where
+`clocks/camera` and `clocks/robot` hold NaN.
 """
 
-_TYPES = {"u1": "uint8", "u2": "uint16", "u4": "uint32", "i4": "int32", "i8": "int64", "f8": "float64"}
+_TYPES = {
+    "u1": "uint8",
+    "u2": "uint16",
+    "u4": "uint32",
+    "i4": "int32",
+    "i8": "int64",
+    "f4": "float32",
+    "f8": "float64",
+}
 _NAMES = {str: "text", int: "integer", float: "float", bool: "boolean"}
 
 
@@ -78,12 +93,14 @@ def page() -> str:
     """The whole page, as it should stand in docs/."""
     sections = [_HEAD, "## Attributes\n", _attributes(), ""]
     for group in dict.fromkeys(_group(dataset) for dataset in DATASETS):
-        sections += [f"## /{group}\n", _datasets([d for d in DATASETS if _group(d) == group]), ""]
+        chosen = [dataset for dataset in DATASETS if _group(dataset) == group]
+        sections += [f"## /{group}\n".replace("//", "/"), _datasets(chosen), "", *_columns(chosen)]
     return "\n".join(sections).rstrip() + "\n"
 
 
 def _group(dataset: Dataset) -> str:
-    return dataset.path.split("/")[0]
+    """The first folder of a data set's path; empty for those in the root."""
+    return dataset.path.split("/")[0] if "/" in dataset.path else ""
 
 
 def _attributes() -> str:
@@ -93,17 +110,39 @@ def _attributes() -> str:
 
 def _described(attribute: Attribute) -> str:
     choices = ": " + ", ".join(f"`{choice}`" for choice in attribute.choices) if attribute.choices else ""
-    return attribute.description + choices + ("" if attribute.required else " (optional)")
+    return attribute.description + choices + _notes(attribute)
+
+
+def _notes(declared: Attribute | Dataset) -> str:
+    """Whether it may be missing, and since when there is such a thing, in brackets."""
+    notes = [] if declared.required else ["optional"]
+    notes += [f"since {MAJOR}.{declared.since}"] if declared.since else []
+    return f" ({', '.join(notes)})" if notes else ""
+
+
+def _columns(datasets: list[Dataset]) -> list[str]:
+    """What a row of each table among some data sets holds."""
+    lines = []
+    for dataset in datasets:
+        if dataset.dtypes[0] in TABLES:
+            columns = ", ".join(f"`{name}` ({_typed(dtype)})" for name, dtype in TABLES[dataset.dtypes[0]])
+            lines.append(f"A row of `{dataset.path}` holds {columns}.\n")
+    return lines
+
+
+def _typed(dtype: str) -> str:
+    kind = dtype.lstrip("<")
+    return f"text of {kind[1:]} bytes" if kind.startswith("S") else _TYPES[kind]
 
 
 def _datasets(datasets: list[Dataset]) -> str:
     rows = [
         (
             f"`{dataset.path}`",
-            " or ".join(_TYPES.get(dtype, dtype) for dtype in dataset.dtypes),
+            " or ".join("table" if dtype in TABLES else _TYPES.get(dtype, dtype) for dtype in dataset.dtypes),
             f"({', '.join(map(str, dataset.shape))})" if dataset.shape else "one",
             dataset.units if dataset.units != "1" else "",
-            dataset.description + ("" if dataset.required else " (optional)"),
+            dataset.description + _notes(dataset),
         )
         for dataset in datasets
     ]

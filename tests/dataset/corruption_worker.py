@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,21 @@ from dataset.session import Session
 from dataset.validate import info, validate
 
 _TRUNCATIONS = 5  # one damage in so many is a cut, the others change one byte
+
+
+COLUMNS = (
+    "frame_ids",
+    "camera_time_ns",
+    "host_time_ns",
+    "exposures_us",
+    "drops",
+    "pauses",
+    "segments",
+    "tcp_offset",
+    "payload",
+    "polarizer_angles",
+    "time_sigma_s",
+)
 
 
 def damage(content: bytes, seed: int, index: int) -> tuple[str, bytes]:
@@ -39,7 +55,8 @@ def values(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
         yield "frames", lambda: len(session)
         for i in range(len(session)):
             yield f"raw {i}", lambda i=i: session.raw(i)
-        for name in ("frame_ids", "camera_time_ns", "host_time_ns", "exposures_us", "drops", "tcp_offset"):
+            yield f"depth {i}", lambda i=i: session.depth(i)
+        for name in COLUMNS:
             yield name, lambda name=name: getattr(session, name)
         yield "clocks", lambda: str(session.clocks)
         yield "mid exposure", lambda: session.mid_exposure_host_ns
@@ -47,6 +64,7 @@ def values(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
         yield "camera poses", lambda: None if session.poses is None else session.poses.as_matrix()
         yield "calibration", lambda: session.calibration_json
         yield "intrinsics", lambda: session.working_intrinsics.K
+        yield "response", lambda: session.polarizer_response and session.polarizer_response.analysis
         for name in session.objects:
             yield (
                 f"object {name}",
@@ -54,6 +72,7 @@ def values(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
             )
             yield f"poses {name}", lambda name=name: session.object_poses(name).T_cam_obj.as_matrix()
             yield f"boxes {name}", lambda name=name: session.object_poses(name).bbox_xywh
+            yield f"visibility {name}", lambda name=name: session.object_poses(name).visible_fraction
             for i in range(len(session)):
                 yield f"mask {name} {i}", lambda name=name, i=i: session.object_poses(name).mask(i)
         yield "splits", lambda: session.splits
@@ -72,11 +91,18 @@ def reading(path: Path) -> tuple[dict[str, str], list[str]]:
     except SessionError as error:
         errors.append(str(error))
     try:
-        summary = info(path)
-        found["info"] = _text((summary.frames, summary.drops, summary.camera, summary.splits, summary.schema))
+        found["info"] = _text(replace(info(path), path="", size_bytes=0, duration_s=0.0))
     except SessionError as error:
         errors.append(str(error))
     return found, errors
+
+
+def problems_of(path: Path) -> list[str]:
+    """What `validate` says, which may be that the file cannot be opened."""
+    try:
+        return [str(problem) for problem in validate(path)]
+    except SessionError as error:
+        return [str(error)]
 
 
 def _text(value: Any) -> str:
@@ -100,8 +126,7 @@ def main() -> None:
         copy.write_bytes(damaged)
         found, errors = reading(copy)
         wrong = [name for name, value in found.items() if truth.get(name) != value]
-        problems = [] if errors else [str(problem) for problem in validate(copy)]
-        result = {"index": index, "wrong": wrong, "errors": errors, "problems": problems}
+        result = {"index": index, "wrong": wrong, "errors": errors, "problems": problems_of(copy)}
         print(json.dumps(result | {"damage": what, "complete": len(found) == len(truth)}), flush=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 
 from dataset import SessionError
 from dataset.convert import convert
-from dataset.schema import VERSION
+from dataset.schema import ATTRIBUTES, DATASETS, MINOR, VERSION
 from dataset.session import Session
 from dataset.session.seals import leave_open, seal
 from dataset.validate import info, validate
@@ -70,6 +71,25 @@ def check_content(session: Session) -> None:
         "train": [0, 1, 4],
         "test": [6, 7],
     }
+
+
+def test_what_1_0_declared_is_frozen() -> None:
+    frozen = json.loads((GOLDEN / "schema-1.0.json").read_text())
+    now = {d.path: d for d in DATASETS}
+    for old in frozen["datasets"]:
+        new = now.pop(old["path"])
+        same = (list(new.dtypes), list(new.shape), new.units, new.required)
+        assert same == (old["dtypes"], old["shape"], old["units"], old["required"]), new.path
+        assert new.since == 0
+    attributes = {(a.group, a.name): a for a in ATTRIBUTES}
+    for old in frozen["attributes"]:
+        attribute = attributes.pop((old["group"], old["name"]))
+        assert (attribute.type.__name__, attribute.required) == (old["type"], old["required"])
+        assert set(attribute.choices) >= set(old["choices"])
+        assert attribute.since == 0
+    assert all(
+        0 < added.since <= MINOR and not added.required for added in [*now.values(), *attributes.values()]
+    )
 
 
 def test_a_newer_minor_version_may_hold_more(tmp_path: Path) -> None:

@@ -101,7 +101,6 @@ def measure(path: Path, size: int, seconds: float) -> dict[str, float]:
         "ratio": images / student_images,
         "h5_read_MBps": h5,
         "raw_read_MBps": raw,
-        "size": size,
     }
 
 

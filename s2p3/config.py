@@ -22,6 +22,9 @@ PhysicsVariant = Literal["dolp", "stokes", "aolp", "dolp-gain", "none"]
 class InputConfig:
     """What the networks see of a frame."""
 
+    modality: Literal["polarization", "rgb", "rgbd"] = "polarization"
+    """`polarization`: intensities, DoLP, AoLP and the priors (the paper). Baselines: `rgb` sees intensities
+    without a polarizer, `rgbd` the depth image, too. Colours are averaged, as everywhere here."""
     size: int = 64
     """Side of the square network input, pixels."""
     zoom: float = 1.4
@@ -68,6 +71,9 @@ class NetworkConfig:
     """Stride of the encoders: 32 as published; 16 keeps the layout of small inputs (our choice)."""
     decoder_channels: int = 64
     """Width of the teacher's decoder."""
+    student: Literal["direct", "large"] = "direct"
+    """`direct`: pose head on the encoders' features (the paper's student); `large`: the teacher's network, of
+    the paper's ablation."""
     head_channels: int = 96
     """Width of the student's pose head."""
     head_hidden: int = 96

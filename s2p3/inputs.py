@@ -2,8 +2,8 @@
 
 A frame's way: undistorted Stokes image (3, H, W) and box -> `extract_crop` (canonical, upright, larger than
 needed) -> `resample` through a `View` (zoom, shift, in-plane rotation) -> `network_input` (channels and
-priors). Everything here is computed from Stokes images, intrinsics, and predicted boxes and masks; no pose,
-mask or normal of the truth is an argument.
+priors). Everything here is computed from Stokes and depth images, intrinsics, and predicted boxes and masks;
+no pose, mask or normal of the truth is an argument.
 
 Resampling happens before the channels are formed, because DoLP, AoLP and the priors are not linear in the
 measurements. An image rotated about the optical axis by `a` (x towards y, so clockwise as displayed) is again
@@ -27,6 +27,8 @@ from dataset import Intrinsics
 from s2p3 import physics
 from s2p3.config import AugmentationConfig, InputConfig
 
+PRIOR_CHANNELS, DEPTH_CHANNELS = 9, 3
+
 _MEAN_INTENSITY = 0.35  # our choice: where `normalize_exposure` puts the mean of a crop
 _FLOOR = 1e-3  # of S0: below it a degree of polarization means nothing
 
@@ -36,25 +38,33 @@ class NetworkInput:
     """B crops as the networks take them.
 
     Attributes:
-        polarization: (B, C, S, S), see `polarization_channels`.
-        priors: (B, 9, S, S), the normals n_d, n_s1, n_s2 of the physical model.
+        polarization: (B, C, S, S), what the first encoder sees, see `polarization_channels`; the intensity of
+            the baselines without polarization.
+        priors: (B, D, S, S), what the second encoder sees: the normals n_d, n_s1, n_s2 of the physical model;
+            of the baselines `depth_channels`, or the intensity again.
         K: (B, 3, 3) intrinsics of the crops, pixel centres at integers.
         stokes: (B, 3, S, S) what the channels were made from, for L_physics.
+        depth: (B, 1, S, S) metres, 0 unknown; None where there is none.
     """
 
     polarization: Tensor
     priors: Tensor
     K: Tensor
     stokes: Tensor
+    depth: Tensor | None = None
 
     @property
     def size(self) -> int:
         return self.polarization.shape[-1]
 
 
-def channel_count(config: InputConfig) -> int:
-    """Number of polarization channels under `config`: seven, or six with the wrapped angle."""
-    return 7 if config.aolp == "double_angle" else 6
+def channel_counts(config: InputConfig) -> tuple[int, int]:
+    """Channels of the two encoders' inputs under `config`."""
+    if config.modality == "rgb":
+        return 1, 1
+    if config.modality == "rgbd":
+        return 1, DEPTH_CHANNELS
+    return 7 if config.aolp == "double_angle" else 6, PRIOR_CHANNELS
 
 
 def square_box(box_xywh: ArrayLike, zoom: float = 1.0) -> NDArray[np.float64]:
@@ -242,24 +252,51 @@ def polarization_channels(stokes: Tensor, config: InputConfig) -> Tensor:
     return torch.cat([angles, torch.stack([dolp, *direction], dim=1)], dim=1)
 
 
+def depth_channels(depth: Tensor, K: Tensor) -> Tensor:
+    """(B, 1, S, S) metres, 0 unknown -> (B, 3, S, S): relief, distance, and where the depth is known.
+
+    Distance is the crop's median depth, relief the difference from it; both as the width of the crop at that
+    depth, metres, so that they mean the same at any zoom, as the scale-invariant translation does (our
+    choice).
+    """
+    known = depth > 0
+    width_at = depth * (depth.shape[-1] / K[:, 0, 0, None, None, None])
+    flat = torch.where(known, width_at, float("nan")).flatten(2)
+    distance = flat.nanmedian(dim=2).values.nan_to_num(0.0)[..., None, None]
+    relief = torch.where(known, width_at - distance, 0.0)
+    return torch.cat([relief, distance.expand_as(relief), known.to(depth.dtype)], dim=1)
+
+
 def network_input(
-    stokes: Tensor, K: Tensor, refractive_index: float, config: InputConfig, mask: Tensor | None = None
+    stokes: Tensor,
+    K: Tensor,
+    refractive_index: float,
+    config: InputConfig,
+    mask: Tensor | None = None,
+    depth: Tensor | None = None,
 ) -> NetworkInput:
-    """Forms the channels and priors of B crops.
+    """Forms what the two encoders see of B crops.
 
     Args:
         stokes: (B, 3, S, S) with normalized exposure.
         K: (B, 3, 3) of the crops.
         refractive_index: of the object; enters the priors.
         mask: (B, 1, S, S) predicted; required where `config.background` is "mask".
+        depth: (B, 1, S, S) metres, 0 unknown; required where `config.modality` is "rgbd".
+
+    Intensities are shown with their background in any case.
     """
-    polarization = polarization_channels(stokes, config)
-    priors = physics.shape_priors(stokes, refractive_index, K)
-    if config.background == "mask":
-        assert mask is not None, "inputs with a masked background need the predicted mask"
-        polarization = torch.cat([polarization[:, :4], polarization[:, 4:] * mask], dim=1)
-        priors = priors * mask
+    assert config.background == "keep" or mask is not None, "a masked background needs the predicted mask"
+    shown = mask if mask is not None and config.background == "mask" else torch.ones_like(stokes[:, :1])
+    first = stokes[:, :1] / 2
+    second = first
+    if config.modality == "polarization":
+        first = polarization_channels(stokes, config)
+        first = torch.cat([first[:, :4], first[:, 4:] * shown], dim=1)
+        second = physics.shape_priors(stokes, refractive_index, K) * shown
+    elif config.modality == "rgbd":
+        assert depth is not None, "rgbd needs depth"
+        second = depth_channels(depth * shown, K)
     last = torch.channels_last
-    return NetworkInput(
-        polarization.contiguous(memory_format=last), priors.contiguous(memory_format=last), K, stokes
-    )
+    first, second = (image.contiguous(memory_format=last) for image in (first, second))
+    return NetworkInput(first, second, K, stokes, depth)

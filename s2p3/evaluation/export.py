@@ -8,9 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from s2p3.inputs import channel_count
+from s2p3.inputs import channel_counts
 from s2p3.networks.detector import detector_input, downsample
-from s2p3.networks.encoder import PRIOR_CHANNELS
 from s2p3.networks.onnx_files import write_onnx
 from s2p3.training import checkpoint
 from s2p3.training.checkpoint import CheckpointInfo
@@ -53,5 +52,5 @@ def _examples(info: CheckpointInfo, image_size: tuple[int, int]) -> tuple[Tensor
         )
         return (detector_input(downsample(stokes, info.config.detector.level)),)
     side = info.config.input.size
-    channels = (channel_count(info.config.input), PRIOR_CHANNELS)
-    return tuple(torch.rand(1, count, side, side, generator=generator) for count in channels)
+    counts = channel_counts(info.config.input)
+    return tuple(torch.rand(1, count, side, side, generator=generator) for count in counts)

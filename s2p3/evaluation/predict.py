@@ -19,7 +19,7 @@ from s2p3.inputs import View
 from s2p3.networks.detector import Detection, DetectorNetwork, detect
 from s2p3.networks.onnx_files import OnnxNetwork
 from s2p3.networks.pose_head import decode_pose
-from s2p3.networks.teacher import TeacherOutput
+from s2p3.networks.teacher import TeacherOutput, pose_of
 from s2p3.training import checkpoint
 from s2p3.training.batches import form_input
 from s2p3.training.checkpoint import CheckpointInfo
@@ -103,8 +103,7 @@ class Estimator:
         crop = single_crop(stokes, detection, intrinsics, config.input)
         view = View.centred(1, config.input.zoom)
         seen = form_input(crop, torch.tensor([0]), view, self.info.refractive_index, config)
-        output = self.network(seen.polarization, seen.priors)
-        pose = output.pose if isinstance(output, TeacherOutput) else output
+        pose = pose_of(self.network(seen.polarization, seen.priors))
         rotation, translation, _ = decode_pose(pose, seen.K, seen.size, self.info.diameter_m)
         T_cam_obj = SE3(rotation[0].double().numpy(), translation[0].double().numpy())
         return PoseEstimate(T_cam_obj, detection.score, detection)

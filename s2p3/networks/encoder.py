@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 from s2p3.networks.lite0 import Lite0, load_imagenet
 
-PRIOR_CHANNELS = 9
 _BLOCKS = 15
 _TAPS = (2, 4, 10)
 
@@ -18,17 +17,23 @@ class DualEncoder(nn.Module):
     Inputs are normalized by a BatchNorm without weights, so that channels of any unit reach the ImageNet
     stems at unit variance (our choice).
 
+    Args:
+        channels: of the two inputs, see `inputs.channel_counts`.
+        total_stride: 16 or 32, see `Lite0`.
+        imagenet: start from ImageNet weights.
+
     Attributes:
         channels: of the deepest features (384).
         skip_channels: of the features at strides 4, 8 and 16.
     """
 
-    def __init__(self, polarization_channels: int, total_stride: int = 32, imagenet: bool = True) -> None:
+    def __init__(self, channels: tuple[int, int], total_stride: int = 32, imagenet: bool = True) -> None:
         super().__init__()
-        self.normalize_polarization = nn.BatchNorm2d(polarization_channels, affine=False, momentum=0.02)
-        self.normalize_priors = nn.BatchNorm2d(PRIOR_CHANNELS, affine=False, momentum=0.02)
-        self.polarization = Lite0(polarization_channels, _BLOCKS, _TAPS, total_stride)
-        self.priors = Lite0(PRIOR_CHANNELS, _BLOCKS, _TAPS, total_stride)
+        first, second = channels
+        self.normalize_polarization = nn.BatchNorm2d(first, affine=False, momentum=0.02)
+        self.normalize_priors = nn.BatchNorm2d(second, affine=False, momentum=0.02)
+        self.polarization = Lite0(first, _BLOCKS, _TAPS, total_stride)
+        self.priors = Lite0(second, _BLOCKS, _TAPS, total_stride)
         if imagenet:
             load_imagenet(self.polarization)
             load_imagenet(self.priors)
@@ -37,7 +42,7 @@ class DualEncoder(nn.Module):
         self.skip_channels = tuple(2 * self.polarization.block_channels[tap] for tap in _TAPS)
 
     def forward(self, polarization: Tensor, priors: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """(B, C, S, S) and (B, 9, S, S) -> features (B, 384, S / stride, S / stride) and skips at strides 4,
+        """(B, C, S, S) and (B, D, S, S) -> features (B, 384, S / stride, S / stride) and skips at strides 4,
         8, 16."""
         a, skips_a = self.polarization(self.normalize_polarization(polarization))
         b, skips_b = self.priors(self.normalize_priors(priors))

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
-from s2p3.networks.teacher import TeacherOutput
+from s2p3.networks.teacher import TeacherOutput, pose_of
 
 TOLERANCE = 1e-4
 """Largest difference between the file's outputs and the network's that is accepted, relative to the largest
@@ -143,7 +143,7 @@ class _OutputTensors(nn.Module):
 
     def forward(self, *images: Tensor) -> Tensor | tuple[Tensor, ...]:
         output: Tensor | tuple[Tensor, ...] | TeacherOutput = self.network(*images)
-        return output.pose if isinstance(output, TeacherOutput) else output
+        return output if isinstance(output, tuple) else pose_of(output)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ class Student(nn.Module):
 
     def __init__(
         self,
-        polarization_channels: int,
+        channels: tuple[int, int],
         size: int,
         total_stride: int = 32,
         width: int = 96,
@@ -23,12 +23,12 @@ class Student(nn.Module):
         imagenet: bool = True,
     ) -> None:
         super().__init__()
-        self.encoder = DualEncoder(polarization_channels, total_stride, imagenet)
+        self.encoder = DualEncoder(channels, total_stride, imagenet)
         self.reduce = nn.Sequential(*conv_norm_leaky(self.encoder.channels + 2, width, 1))
         self.pose = PoseHead(width, (width,), (size // total_stride // 4,), hidden)
 
     def forward(self, polarization: Tensor, priors: Tensor) -> Tensor:
-        """(B, C, S, S) and (B, 9, S, S) -> (B, 9), see `pose_head`."""
+        """(B, C, S, S) and (B, D, S, S) -> (B, 9), see `pose_head`."""
         features, _ = self.encoder(polarization, priors)
         output: Tensor = self.pose(self.reduce(torch.cat([features, coordinate_channels(features)], dim=1)))
         return output

@@ -35,12 +35,17 @@ class TeacherOutput:
     coordinates: Tensor
 
 
+def pose_of(output: Tensor | TeacherOutput) -> Tensor:
+    """The nine numbers (B, 9) of a student's or a teacher's answer."""
+    return output.pose if isinstance(output, TeacherOutput) else output
+
+
 class Teacher(nn.Module):
     """About 5.5 M weights. The pose head is the Patch-PnP of GDR-Net (Wang et al. 2021), narrower (our
     choice).
 
     Args:
-        polarization_channels: of the first input; the second has nine.
+        channels: of the two inputs, see `inputs.channel_counts`.
         size: side of the crops.
         total_stride: of the encoders, 16 or 32.
         width: of the decoder.
@@ -49,21 +54,26 @@ class Teacher(nn.Module):
 
     def __init__(
         self,
-        polarization_channels: int,
+        channels: tuple[int, int],
         size: int,
         total_stride: int = 32,
         width: int = 64,
         imagenet: bool = True,
     ) -> None:
         super().__init__()
-        self.encoder = DualEncoder(polarization_channels, total_stride, imagenet)
+        self.encoder = DualEncoder(channels, total_stride, imagenet)
         skip4, skip8, skip16 = self.encoder.skip_channels
-        reduced, last = width * 3 // 2, width * 3 // 4
-        self.reduce = nn.Sequential(*conv_norm_leaky(self.encoder.channels, reduced, 1))
-        self.decode16 = nn.Sequential(*conv_norm_leaky(reduced + skip16, width))
-        self.decode8 = nn.Sequential(*conv_norm_leaky(width + skip8, width))
-        self.decode4 = nn.Sequential(*conv_norm_leaky(width + skip4, last))
-        self.maps = nn.Conv2d(last, _MAP_CHANNELS, 1)
+        narrow, wide = width * 3 // 4, width * 3 // 2
+        self.reduce = nn.Sequential(*conv_norm_leaky(self.encoder.channels, width, 1))
+        self.skip16 = nn.Sequential(*conv_norm_leaky(skip16, width // 2, 1))
+        self.decode16 = nn.Sequential(*conv_norm_leaky(width + width // 2, narrow))
+        self.decode8 = nn.Sequential(*conv_norm_leaky(narrow + skip8, width))
+        self.decode4 = nn.Sequential(
+            *conv_norm_leaky(width + skip4, wide),
+            *conv_norm_leaky(wide, wide),
+            *conv_norm_leaky(wide, width),
+        )
+        self.maps = nn.Conv2d(width, _MAP_CHANNELS, 1)
         strides = _POSE_STRIDES[size // MAP_STRIDE]
         self.pose = PoseHead(_MAP_CHANNELS + 2, (64, 64, 64, 128), strides, hidden=128)
 
@@ -72,7 +82,7 @@ class Teacher(nn.Module):
         x = self.reduce(features)
         if self.encoder.total_stride == 32:
             x = _double(x)
-        x = self.decode16(torch.cat([x, skip16], dim=1))
+        x = self.decode16(torch.cat([x, self.skip16(skip16)], dim=1))
         x = self.decode8(torch.cat([_double(x), skip8], dim=1))
         x = self.decode4(torch.cat([_double(x), skip4], dim=1))
         maps = self.maps(x)

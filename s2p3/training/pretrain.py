@@ -16,10 +16,10 @@ from dataset.errors import ToolkitError
 from s2p3 import inputs, losses
 from s2p3.config import ExperimentConfig, PretrainConfig
 from s2p3.inputs import View
-from s2p3.networks.lite0 import channels_last
+from s2p3.networks.build import build_student, build_teacher
 from s2p3.networks.pose_head import decode_pose, ray_rotation, site_from_translation
 from s2p3.networks.student import Student
-from s2p3.networks.teacher import Teacher
+from s2p3.networks.teacher import Teacher, pose_of
 from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
 from s2p3.training.batches import Targets, form_input, form_targets
@@ -30,34 +30,6 @@ from s2p3.training.progress import OnStep
 
 MODEL_POINTS = 300
 _SYMMETRY_STEPS = 36
-
-
-def build_teacher(config: ExperimentConfig, imagenet: bool = False) -> Teacher:
-    """The teacher `config` describes."""
-    network = config.network
-    channels = inputs.channel_count(config.input)
-    teacher = Teacher(
-        channels,
-        config.input.size,
-        network.total_stride,
-        network.decoder_channels,
-        imagenet and network.imagenet,
-    )
-    return channels_last(teacher)
-
-
-def build_student(config: ExperimentConfig, imagenet: bool = False) -> Student:
-    """The student `config` describes."""
-    network = config.network
-    student = Student(
-        inputs.channel_count(config.input),
-        config.input.size,
-        network.total_stride,
-        network.head_channels,
-        network.head_hidden,
-        imagenet and network.imagenet,
-    )
-    return channels_last(student)
 
 
 def train_teacher(
@@ -136,7 +108,7 @@ def train_student(
     def loss_at(generator: torch.Generator) -> Losses:
         batch, targets = _draw(crops, model, config, settings.batch, generator)
         output = network(batch.polarization, batch.priors)
-        return pose_terms(output, batch.K, targets, batch.size, model.diameter, points, symmetries)
+        return pose_terms(pose_of(output), batch.K, targets, batch.size, model.diameter, points, symmetries)
 
     path = out / "student.safetensors"
     data = fingerprint(sessions, model, config.input)
@@ -153,7 +125,7 @@ def load_teacher(path: Path, object_name: str | None = None) -> tuple[Teacher, C
     return checkpoint.load_weights(build_teacher(info.config), path), info
 
 
-def load_student(path: Path, object_name: str | None = None) -> tuple[Student, CheckpointInfo]:
+def load_student(path: Path, object_name: str | None = None) -> tuple[Student | Teacher, CheckpointInfo]:
     """Reads a student. Raises ToolkitError as `checkpoint.read_info` and `checkpoint.load_weights`."""
     info = checkpoint.read_info(path, "student", object_name)
     return checkpoint.load_weights(build_student(info.config), path), info

@@ -120,7 +120,7 @@ def test_channels_are_finite_and_as_many_as_said(aolp: str, channels: int) -> No
     stokes[0, 0, 4:] = 1
     stokes[0, 1, 6:] = 1
     seen = inputs.polarization_channels(stokes, config)
-    assert seen.shape[1] == channels == inputs.channel_count(config)
+    assert (seen.shape[1], 9) == (channels, 9) == inputs.channel_counts(config)
     assert seen.isfinite().all()
     assert seen[0, 4, 7, 7] == 1
 
@@ -134,3 +134,36 @@ def test_a_masked_background_reaches_only_the_intensities() -> None:
     assert not seen.priors[..., 4:].any()
     assert not seen.polarization[:, 4:, :, 4:].any()
     assert seen.polarization[:, :4, :, 4:].any()
+
+
+def test_without_polarization_both_encoders_see_the_intensity() -> None:
+    stokes = inputs.stokes_from_intensities(torch.rand(2, 4, 8, 8))
+    K = torch.eye(3).expand(2, -1, -1)
+    config = InputConfig(modality="rgb")
+    seen = inputs.network_input(stokes, K, 1.5, config)
+    assert (seen.polarization.shape[1], seen.priors.shape[1]) == inputs.channel_counts(config)
+    torch.testing.assert_close(seen.polarization[:, 0], inputs.intensities(stokes).mean(1))
+    assert torch.equal(seen.polarization, seen.priors)
+    unpolarized = torch.cat([stokes[:, :1], torch.zeros_like(stokes[:, 1:])], dim=1)
+    assert torch.equal(seen.polarization, inputs.network_input(unpolarized, K, 1.5, config).polarization)
+
+
+def test_depth_reaches_the_second_encoder_as_relief_and_distance() -> None:
+    stokes = inputs.stokes_from_intensities(torch.rand(1, 4, 8, 8))
+    K = torch.tensor([[[100.0, 0, 3.5], [0, 100.0, 3.5], [0, 0, 1.0]]])
+    depth = torch.full((1, 1, 8, 8), 0.5)
+    depth[..., 0, 0], depth[..., 1, 1] = 0.0, 0.55
+    config = InputConfig(modality="rgbd")
+    seen = inputs.network_input(stokes, K, 1.5, config, depth=depth)
+    assert (seen.polarization.shape[1], seen.priors.shape[1]) == inputs.channel_counts(config)
+    relief, distance, known = seen.priors[0]
+    assert known.sum() == 63
+    assert distance[0, 0] == pytest.approx(0.5 * 8 / 100)  # the crop is so wide there
+    assert relief[1, 1] == pytest.approx(0.05 * 8 / 100)
+    assert relief.count_nonzero() == 1
+    assert not inputs.depth_channels(torch.zeros(1, 1, 8, 8), K).any()
+    mask = torch.zeros(1, 1, 8, 8)
+    masked = inputs.network_input(
+        stokes, K, 1.5, InputConfig(modality="rgbd", background="mask"), mask, depth
+    )
+    assert not masked.priors.any()

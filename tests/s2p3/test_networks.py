@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -12,12 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from s2p3.networks import Student, Teacher, detector, pose_head
+from s2p3 import config as presets
+from s2p3.inputs import channel_counts
+from s2p3.networks import Student, Teacher, build_student, build_teacher, detector, pose_head, pose_of
 from s2p3.networks.depthwise import DepthwiseConv
 from s2p3.networks.detector import Detector
 from s2p3.networks.lite0 import Lite0, load_imagenet
 
 IMAGE = np.random.default_rng(0).random((3, 128, 160), dtype=np.float32)
+SEEN = (7, 9)
 SIZES = [(64, 16), (128, 32), (128, 16), (256, 32)]
 
 
@@ -26,20 +31,39 @@ def parameters(network: nn.Module) -> int:
 
 
 def test_the_networks_weigh_what_the_paper_says() -> None:
-    assert parameters(Teacher(7, 256, imagenet=False)) == pytest.approx(5.5e6, rel=0.01)
-    assert parameters(Student(7, 256, imagenet=False)) == pytest.approx(5.0e6, rel=0.01)
+    assert parameters(Teacher(SEEN, 256, imagenet=False)) == pytest.approx(5.5e6, rel=0.01)
+    assert parameters(Student(SEEN, 256, imagenet=False)) == pytest.approx(5.0e6, rel=0.01)
 
 
 @pytest.mark.parametrize(("size", "stride"), SIZES)
 def test_the_networks_predict_at_every_size(size: int, stride: int) -> None:
     polarization, priors = torch.randn(2, 7, size, size), torch.randn(2, 9, size, size)
     with torch.no_grad():
-        output = Teacher(7, size, stride, imagenet=False).eval()(polarization, priors)
-        pose = Student(7, size, stride, imagenet=False).eval()(polarization, priors)
+        output = Teacher(SEEN, size, stride, imagenet=False).eval()(polarization, priors)
+        pose = Student(SEEN, size, stride, imagenet=False).eval()(polarization, priors)
     assert output.pose.shape == pose.shape == (2, 9)
     assert output.mask_logits.shape == (2, 1, size // 4, size // 4)
     assert output.coordinates.shape == output.normals.shape == (2, 3, size // 4, size // 4)
     torch.testing.assert_close(output.normals.norm(dim=1), torch.ones(2, size // 4, size // 4))
+
+
+@pytest.mark.parametrize("modality", ["polarization", "rgb", "rgbd"])
+def test_the_same_networks_run_as_baselines(modality: Literal["polarization", "rgb", "rgbd"]) -> None:
+    base = presets.fast()
+    config = replace(base, input=replace(base.input, modality=modality))
+    images = [torch.randn(2, channels, 64, 64) for channels in channel_counts(config.input)]
+    networks = (build_teacher(config), build_student(config))
+    with torch.no_grad():
+        assert all(pose_of(network.eval()(*images)).shape == (2, 9) for network in networks)
+    weights = [parameters(network) for network in (build_teacher(base), build_student(base))]
+    assert [parameters(network) for network in networks] == pytest.approx(weights, rel=0.01)
+
+
+def test_the_large_student_is_the_teachers_network() -> None:
+    base = presets.fast()
+    large = build_student(replace(base, network=replace(base.network, student="large")))
+    assert isinstance(large, Teacher)
+    assert parameters(large) == parameters(build_teacher(base)) > parameters(build_student(base))
 
 
 def test_every_packaged_weight_of_the_trunk_is_used() -> None:

@@ -9,11 +9,11 @@ import torch
 
 from s2p3 import config as presets
 from s2p3.config import ExperimentConfig
+from s2p3.networks.build import build_student, build_teacher
 from s2p3.networks.detector import Detector
 from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
 from s2p3.training.checkpoint import CheckpointInfo
-from s2p3.training.pretrain import build_student, build_teacher
 
 
 def eager_detector_config() -> ExperimentConfig:

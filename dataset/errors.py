@@ -11,6 +11,10 @@ class ToolkitError(Exception):
     """A mistake or a condition the user can act on. Base of every error the toolkit raises on purpose."""
 
 
+class ToolkitWarning(UserWarning):
+    """Something that works, and that its user should know of: one line, as of an error."""
+
+
 class SessionError(ToolkitError):
     """A session file cannot be read, written or trusted."""
 

@@ -7,7 +7,7 @@ the devices.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
 from typing import Literal
@@ -29,6 +29,7 @@ from acquisition.recorder import (
 from acquisition.rig import Rig, open_camera, open_pose_source, open_robot
 from acquisition.robot import Robot
 from acquisition.routes import Route, board_stills, board_sweep, carried_camera, object_sweeps
+from dataset.errors import SessionError
 from dataset.frames import CameraInfo
 from dataset.schema import Kind
 from dataset.session import SessionWriter
@@ -56,20 +57,25 @@ def capture_board(
         ToolkitError: no view is reachable.
         DeviceError: a device does not answer or stopped.
     """
-    with _devices(rig) as (camera, robot), _writer(out, kind, camera.info, rig) as writer:
+    _refuse_to_overwrite(out)
+    with _devices(rig) as (camera, robot):
         route = board_stills(rig, *_standing(rig, robot), _size(camera), views, seed)
-        return record_stills(camera, robot, route.q, writer, on_progress=on_progress)
+        with _writer(out, kind, camera.info, rig) as writer:
+            return record_stills(camera, robot, route.q, writer, on_progress=on_progress)
 
 
 def capture_board_motion(
     rig: Rig, out: Path, *, seconds: float, seed: int = 1, on_progress: OnProgress = lambda progress: None
 ) -> Progress:
     """The board filmed while the arm moves, from which the clock offset of camera and arm is estimated."""
-    with _devices(rig) as (camera, robot), _writer(out, "hand_eye", camera.info, rig) as writer:
+    _refuse_to_overwrite(out)
+    with _devices(rig) as (camera, robot):
         route = board_sweep(rig, *_standing(rig, robot), _size(camera), seed)
-        robot.move_joints(route.q[0])
-        sweep = _to_and_fro(robot, route)
-        return record_stream(camera, robot, writer, motion=sweep, duration_s=seconds, on_progress=on_progress)
+
+        def begin() -> SessionWriter:
+            return _writer(out, "hand_eye", camera.info, rig)
+
+        return _film(camera, robot, route, begin, seconds, on_progress)
 
 
 def capture_sequence(
@@ -92,18 +98,17 @@ def capture_sequence(
         ToolkitError: no view is reachable.
         DeviceError: a device does not answer or stopped.
     """
-    with ExitStack() as stack:
-        camera, robot = stack.enter_context(_devices(rig))
-        if append:
-            writer = stack.enter_context(SessionWriter.append(out, "sequence", camera.info))
-        else:
-            writer = stack.enter_context(_writer(out, "sequence", camera.info, rig))
+    if not append:
+        _refuse_to_overwrite(out)
+    with _devices(rig) as (camera, robot):
         route = object_sweeps(rig, *_standing(rig, robot))
-        robot.move_joints(route.q[0])
-        motion = _to_and_fro(robot, route)
-        return record_stream(
-            camera, robot, writer, motion=motion, duration_s=seconds, on_progress=on_progress
-        )
+
+        def begin() -> SessionWriter:
+            if append:
+                return SessionWriter.append(out, "sequence", camera.info)
+            return _writer(out, "sequence", camera.info, rig)
+
+        return _film(camera, robot, route, begin, seconds, on_progress)
 
 
 def capture_touches(
@@ -140,6 +145,28 @@ def _guided(
     with open_pose_source(rig) as source, _writer(out, kind, NO_CAMERA, rig) as writer:
         touches = record_touches(source, writer, count, on_progress=on_progress)
     return Progress(len(touches), 0, 1.0)
+
+
+def _film(
+    camera: Camera,
+    robot: Robot,
+    route: Route,
+    begin: Callable[[], SessionWriter],
+    seconds: float,
+    on_progress: OnProgress,
+) -> Progress:
+    """To the beginning of the route; then along it and back until the time is over, filming into the session
+    that `begin` opens."""
+    robot.move_joints(route.q[0])
+    sweep = _to_and_fro(robot, route)
+    with begin() as writer:
+        return record_stream(camera, robot, writer, motion=sweep, duration_s=seconds, on_progress=on_progress)
+
+
+def _refuse_to_overwrite(out: Path) -> None:
+    """Before devices are opened and a route is planned; the file itself is made when both have succeeded."""
+    if out.exists():
+        raise SessionError(f"{out} already exists; choose another name or remove it first")
 
 
 @contextmanager

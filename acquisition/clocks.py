@@ -32,5 +32,6 @@ def _warnings(name: str, clock: DeviceClock, moving: bool) -> Iterator[str]:
         sigma_ms = clock.sigma_ns * 1e-6
         yield (
             f"the {name}'s clock is followed to {sigma_ms:.2g} ms only, {sigma_ms * _SPEED_MM_MS:.2g} mm at "
-            "0.25 m/s: for a while everything arrived late; close other programs, see: s2p3 doctor"
+            "0.25 m/s: for a while everything arrived late, or too little came; close other programs, record "
+            "longer, see: s2p3 doctor"
         )

@@ -29,6 +29,8 @@ NOT_RECEIVED = "lost on the way, or not read in time"
 
 _SECOND_LOOK_S = 0.5
 _LATENCIES = 16384
+_LARGEST_GAP = 100_000
+"""More frames than a camera could lose in an hour: its counter is no counter (our choice)."""
 
 UNKNOWN_FRAME_ID = -1
 """Stands in the ledger for a frame that was asked for and never came."""
@@ -53,7 +55,10 @@ class FrameLedger:
         self._pause: _Pause | None = None
 
     def store(self, frame: RawFrame, chunk: Chunk | None = None) -> None:
-        """Stores the frame, and ledgers those between it and the one before."""
+        """Stores the frame, and ledgers those between it and the one before.
+
+        Raises DeviceError where more are missing than a camera loses, and SessionError where the disk refuses.
+        """
         frame_id = self._arrived(frame.frame_id, frame.host_time_ns)
         self._writer.add_frame(replace(frame, frame_id=frame_id), chunk)
         self.stored += 1
@@ -91,6 +96,11 @@ class FrameLedger:
             self._offset = 0 if before is None else before + 1 - camera_id
             self._last_id = camera_id + self._offset - 1
         frame_id = camera_id + self._offset
+        if frame_id - self._last_id > _LARGEST_GAP:
+            raise DeviceError(
+                f"the camera's frame counter jumped from {self._last_id} to {frame_id}; restart the camera, "
+                "and set how it numbers frames back to its default"
+            )
         for missing in range(self._last_id + 1, frame_id):
             self._enter(missing, NOT_RECEIVED, host_time_ns)
         self._last_id = frame_id

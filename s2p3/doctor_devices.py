@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from dataset.frames import RawFrame
 
 _TRIAL_S = 2.0
+_TRIAL_FRAMES = 8  # of a slow camera, whose clock fewer would not tell
 _LOST_SHARE = 0.01
 _RATE_SHARE = 0.95
 _LARGEST_CLOCK_SIGMA_MS = 1.0
@@ -88,11 +89,11 @@ def _packets(rig: Rig) -> Check:
 
 
 def _free_run(camera: Camera) -> list[RawFrame]:
-    """Two seconds of frames."""
+    """Two seconds of frames, longer where they come slowly."""
     frames: list[RawFrame] = []
     camera.start("free")
     end = time.monotonic() + _TRIAL_S
-    while time.monotonic() < end or len(frames) < 2:
+    while time.monotonic() < end or len(frames) < _TRIAL_FRAMES:
         frames.append(camera.read())
     camera.stop()
     return frames

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from acquisition.cameras.aravis import AravisCamera
 from acquisition.frame_stream import NOT_RECEIVED, QUEUE_FULL, FrameLedger, FrameStream
 from acquisition.recorder import record_stream
 from acquisition.simulation.camera import SimulatedCamera
+from dataset.errors import DeviceError
 from dataset.frames import RawFrame
 from dataset.session import Chunk, Session, SessionWriter
 from dataset.validate import validate
@@ -62,3 +64,19 @@ def test_frames_that_the_disk_cannot_take_are_ledgered(tmp_path: Path, camera: A
     with Session.open(tmp_path / "s.h5") as session:
         assert (len(session), len(session.drops)) == (ledger.stored, ledger.dropped)
         assert QUEUE_FULL.encode() in session.drops["reason"]
+
+
+def test_a_counter_that_jumps_wildly_is_an_error_and_no_endless_ledger(
+    tmp_path: Path, camera: AravisCamera
+) -> None:
+    with SessionWriter(tmp_path / "s.h5", "sequence", camera.info) as writer:
+        ledger = FrameLedger(writer)
+        camera.start("free")
+        frame = camera.read()
+        camera.stop()
+        ledger.store(frame)
+        with pytest.raises(DeviceError, match=r"frame counter jumped from \d+ to \d+; restart the camera"):
+            ledger.store(replace(frame, frame_id=frame.frame_id + 10**12))
+        ledger.store(replace(frame, frame_id=frame.frame_id + 3))
+    with Session.open(tmp_path / "s.h5") as session:
+        assert (len(session), len(session.drops)) == (2, 2)

@@ -57,7 +57,7 @@ class FrameLedger:
     def store(self, frame: RawFrame, chunk: Chunk | None = None) -> None:
         """Stores the frame, and ledgers those between it and the one before.
 
-        Raises DeviceError where more are missing than a camera loses, and SessionError where the disk refuses.
+        Raises DeviceError where more are missing than a camera loses, SessionError where the disk refuses.
         """
         frame_id = self._arrived(frame.frame_id, frame.host_time_ns)
         self._writer.add_frame(replace(frame, frame_id=frame_id), chunk)

@@ -33,6 +33,7 @@ def synthesize(
     backend: Literal["analytic", "path-traced"] = "analytic",
     samples: int = 32,
     executor: Literal["local", "ray"] = "local",
+    depth: Literal["none", "ideal", "tof"] = "none",
 ) -> None:
     """Render a training set: polarized images of the object, with exact poses and masks.
 
@@ -52,10 +53,12 @@ def synthesize(
             Mitsuba 3, with shadows, inter-reflection and glass.
         samples: paths per pixel, at least 16; path-traced only.
         executor: ray uses the cluster that RAY_ADDRESS names, or starts one here.
+        depth: what a depth camera adds to every frame, for the RGB-D baselines; tof errs as time-of-flight
+            cameras do on silhouettes, metal and glass.
     """
     from dataclasses import replace
 
-    from s2p3.synthesis import DOMAINS, Analytic, PathTraced, ViewsLike, session_camera
+    from s2p3.synthesis import DOMAINS, Analytic, PathTraced, ViewsLike, add_depth, session_camera
     from s2p3.synthesis import synthesize as render
 
     at_least(1, workers=workers, count=count)
@@ -72,6 +75,9 @@ def synthesize(
         figures = render(
             model, count, session_camera(intrinsics), seed, out, workers, report, chosen, renderer, executor
         )
+    if depth != "none":
+        with counting("depth") as report:
+            add_depth(out, depth, report)
     say(f"{out}: {count} frames; {figures}")
 
 

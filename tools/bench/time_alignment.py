@@ -5,8 +5,9 @@
 
 Frames reach the host 30 ms after the exposure began, the camera's clock runs 80 ppm fast, the arm's 50 ppm
 slow, and its packages come with jitter; the arm swings at up to 0.25 m/s. One recording calibrates the delay
-from the corners of a board (predicted from the truth, with 0.1 px of noise: no picture is taken), another one
-is the test. The truth is what the simulators, or the formulas of the virtual ones, know.
+from the corners of a board, another one is the test. No picture is looked at: the corners are predicted from
+the truth, with a noise of 0.1 pixel of a picture 2448 wide. The truth is what the simulators, or the formulas
+of the virtual ones, know.
 
     unknown                  frames without a pose: the arm's trace has a hole there
     ours_mm, ours_deg        largest error of `calibration.camera_poses`, as an annotation computes them
@@ -43,11 +44,16 @@ Floats = NDArray[np.float64]
 
 LATENCY_S, CAMERA_PPM, ARM_PPM, JITTER_S = 0.030, 80.0, -50.0, 0.002
 RATE_HZ, ARM_HZ, EXPOSURE_US = 22.0, 500.0, 4000.0
-CORNER_PX = 0.1
+WIDTH, HEIGHT = 256, 192
+SCALE = WIDTH / 2448  # to the pixels of the paper's camera, in which lens and noise are given
+CORNER_PX = 0.1 * SCALE
 TCP = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
 SPEED_M_S = 0.25
 BOARD = BoardSpec(11, 8, 0.035, 0.026, "DICT_5X5_100")
-LENS = Intrinsics(np.array([[1740.0, 0, 1224], [0, 1740.0, 1024], [0, 0, 1]]), np.zeros(0), 2048, 2448)
+FOCAL_PX = 1740.0 * SCALE
+LENS = Intrinsics(
+    np.array([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1]]), np.zeros(0), HEIGHT, WIDTH
+)
 
 
 @dataclass(frozen=True)
@@ -138,13 +144,13 @@ def virtual(path: Path, seed: int, seconds: float) -> Recording:
         )
         return np.maximum.accumulate(epoch_ns + np.rint(1e9 * (at_s + delay_s + late)).astype(np.int64))
 
-    info = CameraInfo("virtual", "virtual", "0", "0", "Mono8", "mono", 2, 2, 8, 0)
+    info = CameraInfo("virtual", "virtual", "0", "0", "Mono8", "mono", WIDTH, HEIGHT, 8, 0)
     exposed = 0.5 + np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     seen_ns = arrival(exposed, LATENCY_S)
     with SessionWriter(path, "sequence", info) as writer:
         for index, (at_s, host_ns) in enumerate(zip(exposed, seen_ns, strict=True)):
             camera_ns = 77_000_000_000 + round(1e9 * at_s * (1 + 1e-6 * CAMERA_PPM))
-            black = np.zeros((2, 2), np.uint8)
+            black = np.zeros((HEIGHT, WIDTH), np.uint8)
             writer.add_frame(RawFrame(black, "Mono8", index, camera_ns, int(host_ns), EXPOSURE_US, 0.0, 0))
         times = np.arange(0.0, latest_s, 1 / ARM_HZ)
         robot_s = 500.0 + times * (1 + 1e-6 * ARM_PPM)
@@ -174,8 +180,8 @@ def on_the_wire(path: Path, seed: int, seconds: float, camera_address: str, host
     with (
         SimulatedCamera(
             camera_address,
-            width=256,
-            height=192,
+            width=WIDTH,
+            height=HEIGHT,
             frame_rate=RATE_HZ,
             latency_s=LATENCY_S,
             drift_ppm=CAMERA_PPM,

@@ -50,6 +50,7 @@ class HandEyeResult:
         covariance: (12, 12) of the twists [rho, phi] dX, dZ (m, rad) in T_mount_cam @ exp(dX),
             T_fixture_board @ exp(dZ), the uncertainty of the intrinsics included when it was given.
         intrinsics: as given, or refined on request.
+        intrinsics_covariance: (4 + n, 4 + n) of those refined; None when they were not.
         offset_s, offset_sigma_s: to add to the camera's times; zero when the arm was at rest.
         rms_px: distance between seen and predicted corners when every view may be off by the arm's noise.
         rigid_rms_px: the same when the arm's poses are taken at their word.
@@ -74,6 +75,7 @@ class HandEyeResult:
     T_fixture_board: SE3
     covariance: Floats
     intrinsics: Intrinsics
+    intrinsics_covariance: Floats | None
     offset_s: float
     offset_sigma_s: float
     rms_px: float
@@ -249,6 +251,7 @@ def _result(
     board = _repeat(state.T_fixture_board, count)
     covariance, names = _with_intrinsics(found, intrinsics_covariance), np.flatnonzero(found.free)
     offset_variance = covariance[names == OFFSET][:, names == OFFSET]
+    lens = names >= CAMERA.start
     held_out_mm, held_out_deg = leave_one_out(found, kept, T_cam_board[used])
     return HandEyeResult(
         mount=state.mount,
@@ -256,6 +259,7 @@ def _result(
         T_fixture_board=state.T_fixture_board,
         covariance=covariance[TRANSFORMS, TRANSFORMS],
         intrinsics=state.camera,
+        intrinsics_covariance=covariance[lens][:, lens] if lens.any() else None,
         offset_s=state.offset_s,
         offset_sigma_s=float(np.sqrt(offset_variance.sum())),
         rms_px=_rms(solution.residual),

@@ -29,6 +29,7 @@ header p { color:var(--soft); margin:0 }
 section { margin-top:44px }
 h2 { font-size:20px; letter-spacing:-.01em; margin:0 0 4px }
 .lead { color:var(--soft); margin:0 0 16px; max-width:75ch }
+.between { margin:16px 0 0 }
 .grid { display:grid; grid-template-columns:repeat(12,1fr); gap:16px }
 figure,.tiles>div,.scroll { background:var(--card); border:1px solid var(--line); border-radius:12px }
 figure { margin:0; padding:14px 14px 12px; display:flex; flex-direction:column }
@@ -121,6 +122,11 @@ def links(pages: Mapping[str, str]) -> str:
     """A line of links: the text of each, and the address relative to this page."""
     anchors = (f'<a href="{escape(address)}">{escape(text)}</a>' for text, address in pages.items())
     return f"<p>{' · '.join(anchors)}</p>"
+
+
+def lead(text: str) -> str:
+    """A sentence between blocks."""
+    return f'<p class="lead between">{escape(text)}</p>'
 
 
 def note(text: str) -> str:

@@ -28,6 +28,8 @@ MIN_VIEWS = 5
 _MIN_TILT_DEG = 10.0
 _MAX_FOCAL_SIGMA = 0.005  # of the focal length
 _MAX_RMS_PX = 3.0
+_SQUARE_PIXELS = 1e-3  # a sensor's pixels are as square as that: fx = fy
+_WRONG_ASPECT = 0.01
 _DISTINCT_PX = 5.0
 _PIXEL_FLOOR = 1e-3
 _FOLDS = 5
@@ -46,6 +48,8 @@ class IntrinsicsResult:
         view_rms_px: (N,) the same a view.
         used: (N,) False for views rejected as outliers.
         coverage: fraction of an 8x6 grid over the image in which a corner was seen.
+        board_aspect, board_aspect_sigma: height over width of the board's squares, which are described as 1,
+            as a camera of square pixels sees it.
         T_cam_board: N poses of the board.
         view, pixels, residual_px: (P,), (P, 2), (P, 2) every corner: its view, where seen, predicted - seen.
     """
@@ -57,6 +61,8 @@ class IntrinsicsResult:
     view_rms_px: Floats
     used: Bools
     coverage: float
+    board_aspect: float
+    board_aspect_sigma: float
     T_cam_board: SE3
     view: NDArray[np.int64]
     pixels: Floats
@@ -84,7 +90,7 @@ def calibrate_intrinsics(
 
     Raises:
         CalibrationError: fewer than 5 (distinct) views, corners outside the image (mixed resolutions), a
-            board that was never tilted, or corners no lens explains.
+            board that was never tilted or whose squares are not square, or corners no lens explains.
     """
     _check_views(detections, spec, image_size)
     observations = Observations.collect(detections, spec)
@@ -105,6 +111,7 @@ def calibrate_intrinsics(
     residual = state.linearize(observations).residual
     corner_used = used[observations.view]
     rms = float(np.sqrt(np.mean(np.sum(residual[corner_used] ** 2, axis=1))))
+    aspect, aspect_sigma = _board_aspect(state.of_views(used), observations.of_views(used))
     _check_result(state, solution, rms, used)
     return IntrinsicsResult(
         intrinsics=intrinsics,
@@ -114,6 +121,8 @@ def calibrate_intrinsics(
         view_rms_px=observations.view_rms(residual),
         used=used,
         coverage=_coverage(observations.pixels[corner_used], image_size),
+        board_aspect=aspect,
+        board_aspect_sigma=aspect_sigma,
         T_cam_board=state.T_cam_board,
         view=observations.view,
         pixels=observations.pixels,
@@ -153,11 +162,12 @@ def board_pose(detection: Detection, spec: BoardSpec, intrinsics: Intrinsics) ->
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Shared: fx, fy, cx, cy, distortion. Own: the pose of the board in each view."""
+    """Shared: fx, fy, cx, cy, distortion, the aspect of the board. Own: its pose in each view."""
 
     K: Floats
     distortion: Floats
     T_cam_board: SE3
+    aspect: float = 1.0
 
     @property
     def deviation(self) -> Floats:
@@ -165,21 +175,36 @@ class _State:
 
     @property
     def shared_deviation(self) -> Floats:
-        return np.zeros(4 + len(self.distortion))
+        """Against a prior about zero: only differences of parameters have one."""
+        return np.concatenate([self.K[[0, 1, 0, 1], [0, 1, 2, 2]], self.distortion, [self.aspect - 1.0]])
+
+    def free(self, aspect: bool = False) -> Bools:
+        """(S,) the camera, and the board's aspect if asked for."""
+        free = np.ones(5 + len(self.distortion), bool)
+        free[-1] = aspect
+        return free
 
     def linearize(self, observations: Observations) -> Linearization:
         pose = self.T_cam_board[observations.view]
-        points = pose.apply(observations.board)
+        board = observations.board * [1.0, self.aspect, 1.0]
+        points = pose.apply(board)
         predicted, by_point, by_camera = project_with_derivatives(points, self.K, self.distortion)
         by_twist = np.concatenate(
-            [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -cross_matrix(observations.board)], axis=2
+            [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -cross_matrix(board)], axis=2
         )
-        return Linearization(predicted - observations.pixels, by_camera, by_point @ pose.rotation @ by_twist)
+        by_board = by_point @ pose.rotation
+        by_aspect = by_board[..., 1:2] * observations.board[:, 1, None, None]
+        return Linearization(
+            predicted - observations.pixels,
+            np.concatenate([by_camera, by_aspect], axis=2),
+            by_board @ by_twist,
+        )
 
     def moved(self, shared: Floats, own: Floats) -> _State:
         K = self.K.copy()
         K[[0, 1, 0, 1], [0, 1, 2, 2]] += shared[:4]
-        return _State(K, self.distortion + shared[4:], self.T_cam_board @ SE3.exp(own))
+        distortion, aspect = self.distortion + shared[4:-1], self.aspect + float(shared[-1])
+        return _State(K, distortion, self.T_cam_board @ SE3.exp(own), aspect)
 
     def of_views(self, keep: Bools) -> _State:
         return replace(self, T_cam_board=self.T_cam_board[keep])
@@ -216,16 +241,37 @@ def _pose_of(observations: Observations, corners: Bools, camera: Intrinsics) -> 
     return SE3.from_rotvec(rotation.ravel(), translation.ravel())
 
 
-def _refine(state: _State, observations: Observations) -> tuple[_State, Solution]:
+def _refine(
+    state: _State, observations: Observations, aspect: bool = False, information: Floats | None = None
+) -> tuple[_State, Solution]:
     """Solve, take the corners' noise from the residuals, and solve again with it."""
-    free = np.ones(4 + len(state.distortion), bool)
+    free = state.free(aspect)
     no_prior = np.full((observations.view_count, 6), np.inf)
     pixel_sigma = 1.0
     for _ in range(3):
-        state, solution = solve(state, observations, pixel_sigma, no_prior, free)
-        freedom = 2 * len(observations.view) - len(free) - 6 * observations.view_count
+        state, solution = solve(state, observations, pixel_sigma, no_prior, free, information)
+        freedom = 2 * len(observations.view) - np.count_nonzero(free) - 6 * observations.view_count
         pixel_sigma = max(solution.pixel_noise(freedom), _PIXEL_FLOOR)
-    return solve(state, observations, pixel_sigma, no_prior, free)
+    return solve(state, observations, pixel_sigma, no_prior, free, information)
+
+
+def _board_aspect(state: _State, observations: Observations) -> tuple[float, float]:
+    """The board's aspect and its standard deviation: what a camera with square pixels makes of it.
+
+    Raises:
+        CalibrationError: the squares are not square, and that explains the pictures.
+    """
+    information = np.zeros((len(state.free()), len(state.free())))
+    information[:2, :2] = np.array([[1, -1], [-1, 1]]) / (_SQUARE_PIXELS * state.K[0, 0]) ** 2
+    found, solution = _refine(state, observations, True, information)
+    sigma = float(np.sqrt(solution.covariance[-1, -1]))
+    rms = float(np.sqrt(np.mean(np.sum(solution.residual**2, axis=1))))
+    if abs(found.aspect - 1) > max(_WRONG_ASPECT, 6 * sigma) and rms < _MAX_RMS_PX:
+        raise CalibrationError(
+            f"intrinsics: the board's squares are {found.aspect:.3f} times as high as wide; it was stretched"
+            " by the printer: print it at 100 %, without fitting to the page, and measure both directions"
+        )
+    return found.aspect, sigma
 
 
 def _held_out(state: _State, observations: Observations) -> float:
@@ -239,7 +285,7 @@ def _held_out(state: _State, observations: Observations) -> float:
         trained, _ = _refine(state.of_views(~test), observations.of_views(~test))
         unseen = observations.of_views(test)
         posed = replace(trained, T_cam_board=state.T_cam_board[test])
-        frozen = np.zeros(4 + len(state.distortion), bool)
+        frozen = np.zeros(len(state.free()), bool)
         _, solution = solve(posed, unseen, 0.1, np.full((unseen.view_count, 6), np.inf), frozen)
         squares.append(np.sum(solution.residual**2, axis=1))
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else float("nan")

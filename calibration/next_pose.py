@@ -16,6 +16,9 @@ from calibration.hand_eye_model import TRANSFORMS
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3
 
+Reachable = Callable[[SE3], Bools]
+"""Tells of K arm poses which (K,) the arm reaches."""
+
 _LEVER_M = 0.5
 """Distance at which a rotation's error is weighed against a position's (our choice: a camera's distance from
 what it looks at)."""
@@ -47,7 +50,7 @@ class NextPose:
 def next_pose(
     result: HandEyeResult,
     spec: BoardSpec,
-    reachable: Callable[[SE3], Bools] | None = None,
+    reachable: Reachable | None = None,
     candidates: int = 300,
     seed: int = 0,
 ) -> NextPose:

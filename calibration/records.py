@@ -52,7 +52,8 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsRecord:
-    """K and distortion at the mosaic's grid; covariance (4 + n, 4 + n) of fx, fy, cx, cy, distortion."""
+    """K and distortion at the mosaic's grid; covariance (4 + n, 4 + n) of fx, fy, cx, cy, distortion; what is
+    odd, in words."""
 
     intrinsics: Intrinsics
     covariance: Floats
@@ -60,9 +61,12 @@ class IntrinsicsRecord:
     held_out_px: float
     views: int
     sources: tuple[Source, ...]
+    warnings: tuple[str, ...] = ()
 
     @staticmethod
-    def of(result: IntrinsicsResult, sources: tuple[Source, ...]) -> IntrinsicsRecord:
+    def of(
+        result: IntrinsicsResult, sources: tuple[Source, ...], warnings: tuple[str, ...] = ()
+    ) -> IntrinsicsRecord:
         """The part of a result that is kept."""
         return IntrinsicsRecord(
             result.intrinsics,
@@ -71,12 +75,14 @@ class IntrinsicsRecord:
             result.held_out_px,
             int(result.used.sum()),
             sources,
+            warnings,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class HandEyeRecord:
-    """The camera on the tool, the board in the base; covariance (12, 12) of both twists; the arm's noise."""
+    """The camera on the tool, the board in the base; covariance (12, 12) of both twists; the arm's noise;
+    what is odd, in words."""
 
     T_tcp_cam: SE3
     T_base_board: SE3
@@ -88,9 +94,12 @@ class HandEyeRecord:
     arm_sigma_rad: float
     views: int
     sources: tuple[Source, ...]
+    warnings: tuple[str, ...] = ()
 
     @staticmethod
-    def of(result: HandEyeResult, sources: tuple[Source, ...]) -> HandEyeRecord:
+    def of(
+        result: HandEyeResult, sources: tuple[Source, ...], warnings: tuple[str, ...] = ()
+    ) -> HandEyeRecord:
         """The part of a result that is kept."""
         return HandEyeRecord(
             result.T_tcp_cam,
@@ -103,6 +112,7 @@ class HandEyeRecord:
             result.arm_sigma_rad,
             int(result.used.sum()),
             sources,
+            warnings,
         )
 
 
@@ -120,9 +130,12 @@ class FixedCameraRecord:
     arm_sigma_rad: float
     views: int
     sources: tuple[Source, ...]
+    warnings: tuple[str, ...] = ()
 
     @staticmethod
-    def of(result: HandEyeResult, sources: tuple[Source, ...]) -> FixedCameraRecord:
+    def of(
+        result: HandEyeResult, sources: tuple[Source, ...], warnings: tuple[str, ...] = ()
+    ) -> FixedCameraRecord:
         """The part of a result that is kept.
 
         Raises:
@@ -139,6 +152,7 @@ class FixedCameraRecord:
             result.arm_sigma_rad,
             int(result.used.sum()),
             sources,
+            warnings,
         )
 
 

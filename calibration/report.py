@@ -13,6 +13,7 @@ from calibration.board import BoardSpec
 from calibration.detection import intensity_image
 from calibration.hand_eye import HandEyeResult
 from calibration.intrinsics import IntrinsicsResult
+from calibration.next_pose import NextPose
 from calibration.resampling import Intervals
 from calibration.time_offset import TimeOffsetResult
 from dataset.frames import Mosaic
@@ -28,36 +29,62 @@ class ViewPicture:
     view: int
 
 
-def calibration_report(
-    spec: BoardSpec | None,
-    intrinsics: IntrinsicsResult | None = None,
-    hand_eye: HandEyeResult | None = None,
-    time_offset: TimeOffsetResult | None = None,
+def intrinsics_report(
+    spec: BoardSpec,
+    result: IntrinsicsResult,
+    frames: Sequence[int],
     pictures: Sequence[ViewPicture] = (),
-    intervals: Intervals | None = None,
-    title: str = "Calibration report",
+    warnings: Sequence[str] = (),
     subtitle: str = "",
 ) -> str:
-    """The page as text, with a section for every result given.
+    """The page of the intrinsics.
 
     Args:
-        spec: the board, where one was used.
-        intrinsics, hand_eye, time_offset: results.
-        pictures: of views of ``hand_eye`` where given, else of ``intrinsics``, to draw the corners on.
-        intervals: of ``hand_eye``, by the bootstrap.
-        title, subtitle: of the page.
+        spec: the board.
+        result: of N views.
+        frames: (N,) the session's frame of every view, which names it.
+        pictures: of some views, to draw the corners on.
+        warnings: in words, to be shown first.
+        subtitle: of the page.
     """
-    sections: list[str] = []
-    if intrinsics is not None:
-        sections.append(_intrinsics(intrinsics, pictures if hand_eye is None else ()))
-    if hand_eye is not None:
-        sections.append(_hand_eye(hand_eye, pictures, intervals))
-    if time_offset is not None:
-        sections.append(_time_offset(time_offset))
-    return html.page(title, subtitle, sections, "" if spec is None else f"Board: {spec}.")
+    return _page(spec, _intrinsics(result, frames, pictures, warnings), subtitle)
 
 
-def _intrinsics(result: IntrinsicsResult, pictures: Sequence[ViewPicture]) -> str:
+def hand_eye_report(
+    spec: BoardSpec,
+    result: HandEyeResult,
+    frames: Sequence[int],
+    pictures: Sequence[ViewPicture] = (),
+    intervals: Intervals | None = None,
+    advice: NextPose | None = None,
+    warnings: Sequence[str] = (),
+    subtitle: str = "",
+) -> str:
+    """The page of the hand-eye transform.
+
+    Args:
+        spec, result, frames, pictures, warnings, subtitle: as in `intrinsics_report`.
+        intervals: by the bootstrap.
+        advice: the view to take next.
+    """
+    return _page(spec, _hand_eye(result, frames, pictures, intervals, advice, warnings), subtitle)
+
+
+def time_offset_report(spec: BoardSpec, result: TimeOffsetResult, subtitle: str = "") -> str:
+    """The page of the time offset."""
+    return _page(spec, _time_offset(result), subtitle)
+
+
+def _page(spec: BoardSpec, section: str, subtitle: str) -> str:
+    return html.page("Calibration report", subtitle, [section], f"Board: {spec}.")
+
+
+def _intrinsics(
+    result: IntrinsicsResult,
+    frames: Sequence[int],
+    pictures: Sequence[ViewPicture],
+    warnings: Sequence[str],
+) -> str:
     camera, sigma = result.intrinsics, result.sigma
     size = camera.height, camera.width
     outlier = ~result.used[result.view]
@@ -74,12 +101,13 @@ def _intrinsics(result: IntrinsicsResult, pictures: Sequence[ViewPicture]) -> st
         for i, (name, v, s) in enumerate(zip(names, values, sigma, strict=False))
     ]
     relative = 100 * sigma[0] / camera.K[0, 0]
-    rejected = np.flatnonzero(~result.used)
-    labels = [str(i) for i in range(len(result.used))]
+    labels = [str(frame) for frame in frames]
     return html.section(
         "Intrinsics",
         "Each dot is a board corner. A good calibration leaves a small round cloud without a pattern over the"
-        " image; arrows that agree with their neighbours mean that the lens model or the board is wrong.",
+        " image; arrows that agree with their neighbours mean that the lens model or the board is wrong."
+        " Views are named by their frame in the session.",
+        *_notes(warnings),
         html.grid(
             html.figure(
                 field, f"Corners over the image and their residuals, {magnify:g} times magnified.", 7
@@ -99,12 +127,18 @@ def _intrinsics(result: IntrinsicsResult, pictures: Sequence[ViewPicture]) -> st
             ),
             html.figure(
                 view_plots.view_residuals(
-                    result.view, result.pixels, result.residual_px, result.view_rms_px, result.used, size
+                    result.view,
+                    result.pixels,
+                    result.residual_px,
+                    result.view_rms_px,
+                    result.used,
+                    labels,
+                    size,
                 ),
                 "Residuals of every view, magnified alike, with their rms.",
                 12,
             ),
-            *_overlays(pictures, result.view, result.pixels, result.residual_px),
+            *_overlays(pictures, labels, result.view, result.pixels, result.residual_px),
         ),
         html.tiles(
             html.Tile("Reprojection", f"{result.rms_px:.3f} px", "rms, at mosaic resolution"),
@@ -118,20 +152,32 @@ def _intrinsics(result: IntrinsicsResult, pictures: Sequence[ViewPicture]) -> st
                 "of an 8 x 6 grid over the image",
                 "plain" if result.coverage > 0.6 else "warn",
             ),
-            html.Tile("Views", f"{result.used.sum()} of {len(result.used)}", _rejected(rejected)),
+            html.Tile(
+                "Board's squares",
+                f"{100 * (result.board_aspect - 1):+.3f} %",
+                f"higher than wide, ± {100 * result.board_aspect_sigma:.3f} %",
+            ),
+            html.Tile("Views", f"{result.used.sum()} of {len(result.used)}", _left_out(result.used, labels)),
         ),
         html.table(["Parameter", "Value", "Standard deviation", "Unit"], rows),
     )
 
 
-def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture], intervals: Intervals | None) -> str:
+def _hand_eye(
+    result: HandEyeResult,
+    frames: Sequence[int],
+    pictures: Sequence[ViewPicture],
+    intervals: Intervals | None,
+    advice: NextPose | None,
+    warnings: Sequence[str],
+) -> str:
     outlier = ~result.used[result.view]
     width, height = result.board_size_m
     corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]])
     board = result.T_base_board_seen[0].apply(corners)
     sketch = plots.pose_sketch(result.T_base_cam, board, result.used, "base")
     on_tool = result.mount == "eye_in_hand"
-    labels = [str(i) for i in range(len(result.used))]
+    labels = [str(frame) for frame in frames]
     pose = result.T_mount_cam.as_pose6()
     sigma = np.sqrt(np.diagonal(result.covariance)[:6])
     half = [""] * 6
@@ -155,8 +201,9 @@ def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture], intervals:
     return html.section(
         "Hand-eye",
         "The camera on the tool and the board in the arm's base frame, from stills. Residuals here take"
-        " the arm's"
-        " poses at their word, so they show the arm's repeatability as well as the camera's.",
+        " the arm's poses at their word, so they show the arm's repeatability as well as the camera's. Views"
+        " are named by their frame in the session.",
+        *_notes(warnings),
         html.grid(
             html.figure(sketch, "Where the camera was, and the board, in the arm's base frame.", 7),
             html.figure(
@@ -167,7 +214,7 @@ def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture], intervals:
                 "Residual of every view (rms); views in the second colour were left out.",
                 12,
             ),
-            *_overlays(pictures, result.view, result.pixels, result.residual_px),
+            *_overlays(pictures, labels, result.view, result.pixels, result.residual_px),
         ),
         html.tiles(
             html.Tile(
@@ -201,9 +248,10 @@ def _hand_eye(result: HandEyeResult, pictures: Sequence[ViewPicture], intervals:
             html.Tile(
                 "Views",
                 f"{result.used.sum()} of {len(result.used)}",
-                _rejected(np.flatnonzero(~result.used)),
+                _left_out(result.used, labels),
             ),
         ),
+        *([] if advice is None else [html.lead(f"The view that would tell most next: {advice.reason}.")]),
         html.table(
             ["T_tcp_cam" if on_tool else "T_base_cam", "Value", "Standard deviation", "95 % (bootstrap)"],
             rows,
@@ -266,8 +314,13 @@ def _time_offset(result: TimeOffsetResult) -> str:
     )
 
 
+def _notes(warnings: Sequence[str]) -> list[str]:
+    return [html.note(f"Look at this: {words}.") for words in warnings]
+
+
 def _overlays(
     pictures: Sequence[ViewPicture],
+    labels: Sequence[str],
     view: NDArray[np.int64],
     pixels: NDArray[np.float64],
     residual_px: NDArray[np.float64],
@@ -282,12 +335,13 @@ def _overlays(
         drawn.append(
             html.figure(
                 plots.overlay(grey, seen, seen + residual_px[corners], 2),
-                f"View {shown.view}: corners seen (rings) and predicted (crosses), on S0.",
+                f"Frame {labels[shown.view]}: corners seen (rings) and predicted (crosses), on S0.",
                 6,
             )
         )
     return drawn
 
 
-def _rejected(views: NDArray[np.intp]) -> str:
-    return "none left out" if len(views) == 0 else f"left out: {', '.join(map(str, views[:12]))}"
+def _left_out(used: NDArray[np.bool_], labels: Sequence[str]) -> str:
+    names = [label for label, kept in zip(labels, used, strict=True) if not kept]
+    return f"left out: {', '.join(names[:12])}" if names else "none left out"

@@ -76,18 +76,43 @@ def hand_eye_from_session(
     intrinsics: IntrinsicsRecord,
     detections: Detections | None = None,
     mount: Mount = "eye_in_hand",
+    refine_camera: bool = False,
 ) -> HandEyeResult:
     """Where camera and board are, from stills of a fixed board, or by a fixed camera of a board on the tool;
     views in which the arm was not at rest are left out.
 
+    Args:
+        session: kind "hand_eye".
+        spec: the board.
+        intrinsics: of the same camera.
+        detections: of `detect_session`, if it ran already.
+        mount: who carries the camera.
+        refine_camera: refine the intrinsics, too, starting from their covariance.
+
     Raises:
-        CalibrationError: as `detect_session` and `calibrate_hand_eye`, or no robot trace.
+        CalibrationError: as `detect_session` and `calibrate_hand_eye`, no robot trace, or intrinsics of
+            another resolution.
     """
+    require_resolution(session, intrinsics)
     detections = detect_session(session, spec) if detections is None else detections
     views, poses = views_at_rest(session, detections)
-    return calibrate_hand_eye(
-        poses, [d for _, d in views], spec, intrinsics.intrinsics, intrinsics.covariance, mount
-    )
+    corners, covariance = [d for _, d in views], intrinsics.covariance
+    return calibrate_hand_eye(poses, corners, spec, intrinsics.intrinsics, covariance, mount, refine_camera)
+
+
+def require_resolution(session: Session, intrinsics: IntrinsicsRecord) -> None:
+    """Raises when a session's pictures are not of the size that the intrinsics are for.
+
+    Raises:
+        CalibrationError: naming both sizes.
+    """
+    camera, known = session.camera, intrinsics.intrinsics
+    if (camera.width, camera.height) != (known.width, known.height):
+        raise CalibrationError(
+            f"{session.path}: pictures of {camera.width}x{camera.height} pixels, the intrinsics are for"
+            f" {known.width}x{known.height}; record all sessions at one resolution, without binning, or"
+            " calibrate the intrinsics again"
+        )
 
 
 def views_at_rest(session: Session, detections: Detections) -> tuple[Detections, SE3]:
@@ -122,8 +147,10 @@ def time_offset_from_session(
     Its uncertainty includes that of both clocks: what they are off here is taken for delay.
 
     Raises:
-        CalibrationError: as `detect_session` and `estimate_time_offset`, or no robot trace.
+        CalibrationError: as `detect_session` and `estimate_time_offset`, no robot trace, or intrinsics of
+            another resolution.
     """
+    require_resolution(session, intrinsics)
     detections = detect_session(session, spec) if detections is None else detections
     times, trace = arm_trace(session)
     chosen = [index for index, _ in detections]
@@ -148,10 +175,16 @@ def arm_trace(session: Session) -> tuple[NDArray[np.int64], SE3]:
     The controller's own clock, mapped by its fit, is used where there is one: it does not jitter.
 
     Raises:
-        CalibrationError: the session has no robot trace.
+        CalibrationError: the session has no robot trace, or one with poses that are NaN.
     """
     if session.robot is None or len(session.robot) < 2:
         raise CalibrationError(f"{session.path}: no robot trace; record it with the arm connected")
+    bad = np.flatnonzero(~np.isfinite(session.robot.pose).all(axis=1))
+    if len(bad):
+        raise CalibrationError(
+            f"{session.path}: the arm's pose is NaN or infinite in {len(bad)} of {len(session.robot)} samples"
+            f" of its trace (the first is sample {bad[0]}); the trace is damaged: record it again"
+        )
     fit = session.clocks.robot
     if fit is None:
         times = session.robot.host_time_ns

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration import remarks
 from calibration.board import BoardSpec
 from calibration.closed_forms import Mount
-from calibration.next_pose import NextPose, next_pose
+from calibration.hand_eye import HandEyeResult
+from calibration.next_pose import NextPose, Reachable, next_pose
 from calibration.records import (
     FixedCameraRecord,
     HandEyeRecord,
@@ -21,7 +23,7 @@ from calibration.records import (
     Source,
     TimeOffsetRecord,
 )
-from calibration.report import ViewPicture, calibration_report
+from calibration.report import ViewPicture, hand_eye_report, intrinsics_report, time_offset_report
 from calibration.resampling import Intervals, bootstrap
 from calibration.result import Calibration
 from calibration.sessions import (
@@ -30,45 +32,53 @@ from calibration.sessions import (
     detect_session,
     hand_eye_from_session,
     intrinsics_from_session,
+    require_resolution,
     time_offset_from_session,
     views_at_rest,
 )
 from calibration.view_selection import select_views
+from dataset.errors import CalibrationError
 from dataset.session import Session
 
 _PICTURES = 3
+_NO_PRIOR = 1e6
+"""Times a covariance: as good as no knowledge, and still invertible."""
 
 
 def add_intrinsics(
     session: Path, spec: BoardSpec, calibration: Path, on_progress: Progress | None = None
 ) -> IntrinsicsRecord:
     """Estimates K and distortion from stills of the board. What was estimated with other intrinsics goes:
-    hand-eye and time offset; polarizers, tool tip and objects stay.
+    hand-eye, the fixed camera's place and the time offset; polarizers, tool tip and objects stay.
 
     Raises:
         CalibrationError: as `intrinsics_from_session`.
         SessionError: the session cannot be read.
     """
+    known = Calibration.load(calibration) if calibration.exists() else Calibration()
     with Session.open(session) as opened:
         found = detect_session(opened, spec, on_progress)
         found = [found[i] for i in select_views([d for _, d in found], spec)]
         result = intrinsics_from_session(opened, spec, found)
         pictures = _pictures(opened, found)
-    record = IntrinsicsRecord.of(result, (Source.of(session),))
-    known = Calibration.load(calibration) if calibration.exists() else Calibration()
-    replace(known, board=spec, intrinsics=record, hand_eye=None, time_offset=None).save(calibration)
-    html = calibration_report(spec, intrinsics=result, pictures=pictures, subtitle=str(session))
-    report_path(calibration, "intrinsics").write_text(html, encoding="utf-8")
+    frames = [index for index, _ in found]
+    warnings = remarks.of_intrinsics(result, frames)
+    record = IntrinsicsRecord.of(result, (Source.of(session),), warnings)
+    kept = replace(known, hand_eye=None, fixed_camera=None, time_offset=None)
+    replace(kept, board=spec, intrinsics=record).save(calibration)
+    page = intrinsics_report(spec, result, frames, pictures, warnings, str(session))
+    report_path(calibration, "intrinsics").write_text(page, encoding="utf-8")
     return record
 
 
 @dataclass(frozen=True, eq=False)
 class HandEyeStep:
-    """What was added, its 95 % bootstrap intervals, and the view to take next for a better one."""
+    """What was added, its 95 % bootstrap intervals, and the view to take next for a better one; None where no
+    further view of the board is within reach."""
 
     record: HandEyeRecord | FixedCameraRecord
     intervals: Intervals
-    advice: NextPose
+    advice: NextPose | None
 
 
 def add_hand_eye(
@@ -77,9 +87,20 @@ def add_hand_eye(
     calibration: Path,
     on_progress: Progress | None = None,
     mount: Mount = "eye_in_hand",
+    refine_camera: bool = False,
+    reachable: Reachable | None = None,
 ) -> HandEyeStep:
     """Estimates T_tcp_cam and T_base_board from stills of the board; of a fixed camera (eye to hand),
     T_base_cam and T_tcp_board.
+
+    Args:
+        session: stills of the board, the arm at rest.
+        spec: the board.
+        calibration: file with the intrinsics, to add the result to.
+        on_progress: told of every frame searched for the board.
+        mount: who carries the camera.
+        refine_camera: refine the intrinsics with the transforms, and keep them.
+        reachable: tells of K arm poses with the session's tool which (K,) the arm reaches; all by default.
 
     Raises:
         CalibrationError: no intrinsics yet; as `hand_eye_from_session`.
@@ -88,25 +109,54 @@ def add_hand_eye(
     known = Calibration.load(calibration)
     known.require("intrinsics")
     assert known.intrinsics is not None
+    source = Source.of(session)
+    prior = known.intrinsics
+    if refine_camera and source in prior.sources:
+        # The same pictures must not count twice.
+        prior = replace(prior, covariance=_NO_PRIOR * prior.covariance)
     with Session.open(session) as opened:
+        require_resolution(opened, prior)
         found = detect_session(opened, spec, on_progress)
         views, _ = views_at_rest(opened, found)  # the result counts these, not all that show the board
-        result = hand_eye_from_session(opened, spec, known.intrinsics, views, mount)
+        result = hand_eye_from_session(opened, spec, prior, views, mount, refine_camera)
         pictures = _pictures(opened, views)
-    sources = (Source.of(session),)
+    frames = [index for index, _ in views]
+    warnings = remarks.of_hand_eye(result, frames)
+    changed = Calibration(board=spec, intrinsics=_refined(known.intrinsics, result, source))
     record: HandEyeRecord | FixedCameraRecord
     if mount == "eye_in_hand":
-        record = HandEyeRecord.of(result, sources)
-        known.merged(Calibration(board=spec, hand_eye=record)).save(calibration)
+        record = HandEyeRecord.of(result, (source,), warnings)
+        known.merged(replace(changed, hand_eye=record)).save(calibration)
     else:
-        record = FixedCameraRecord.of(result, sources)
-        known.merged(Calibration(board=spec, fixed_camera=record)).save(calibration)
-    step = HandEyeStep(record, bootstrap(result), next_pose(result, spec))
-    html = calibration_report(
-        spec, hand_eye=result, pictures=pictures, subtitle=str(session), intervals=step.intervals
+        record = FixedCameraRecord.of(result, (source,), warnings)
+        known.merged(replace(changed, fixed_camera=record)).save(calibration)
+    step = HandEyeStep(record, bootstrap(result), _advice(result, spec, reachable))
+    page = hand_eye_report(
+        spec, result, frames, pictures, step.intervals, step.advice, warnings, str(session)
     )
-    report_path(calibration, "hand-eye").write_text(html, encoding="utf-8")
+    report_path(calibration, "hand-eye").write_text(page, encoding="utf-8")
     return step
+
+
+def _refined(before: IntrinsicsRecord, result: HandEyeResult, source: Source) -> IntrinsicsRecord | None:
+    """The intrinsics that were refined with the transforms; None when they were not."""
+    if result.intrinsics_covariance is None:
+        return None
+    return replace(
+        before,
+        intrinsics=result.intrinsics,
+        covariance=result.intrinsics_covariance,
+        rms_px=result.rms_px,
+        held_out_px=float("nan"),
+        sources=tuple(dict.fromkeys((*before.sources, source))),
+    )
+
+
+def _advice(result: HandEyeResult, spec: BoardSpec, reachable: Reachable | None) -> NextPose | None:
+    try:
+        return next_pose(result, spec, reachable)
+    except CalibrationError:  # nothing to advise is no reason to lose the result
+        return None
 
 
 def add_time_offset(
@@ -122,13 +172,19 @@ def add_time_offset(
     known.require("intrinsics", "hand_eye")
     assert known.intrinsics is not None
     assert known.hand_eye is not None
+    if known.board is not None and known.board != spec:
+        raise CalibrationError(
+            f"{calibration}: hand-eye was calibrated with another board ({known.board}; this is {spec}); give"
+            " the rig file it was calibrated with, or run `s2p3 calibrate hand-eye` again"
+        )
     with Session.open(session) as opened:
+        require_resolution(opened, known.intrinsics)
         found = detect_session(opened, spec, on_progress)
         result = time_offset_from_session(opened, spec, known.intrinsics, known.hand_eye, found)
     record = TimeOffsetRecord.of(result, (Source.of(session),))
     known.merged(Calibration(time_offset=record)).save(calibration)
-    html = calibration_report(spec, time_offset=result, subtitle=str(session))
-    report_path(calibration, "time-offset").write_text(html, encoding="utf-8")
+    page = time_offset_report(spec, result, str(session))
+    report_path(calibration, "time-offset").write_text(page, encoding="utf-8")
     return record
 
 

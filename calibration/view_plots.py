@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
@@ -43,6 +44,7 @@ def view_residuals(
     residual_px: Floats,
     view_rms_px: Floats,
     used: NDArray[np.bool_],
+    labels: Sequence[str],
     image_size: tuple[int, int],
 ) -> str:
     """A small picture a view: its corners (P, 2) in the image, each with its residual, magnified alike in all
@@ -64,7 +66,7 @@ def view_residuals(
         path = "".join(
             f"M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}" for (x, y), (dx, dy) in zip(starts, arrows, strict=True)
         )
-        label = f"{index}: {view_rms_px[index]:.2f} px" + ("" if used[index] else ", left out")
+        label = f"{labels[index]}: {view_rms_px[index]:.2f} px" + ("" if used[index] else ", left out")
         parts.append(
             f'<g transform="translate({left:.0f} {top:.0f})"><rect width="{_PANEL:.0f}"'
             f' height="{panel_h:.0f}" rx="4" fill="none" stroke="var(--line)"/>'

@@ -14,8 +14,12 @@ from s2p3.commands.arguments import ObjectName, OptionalPath, at_least
 from s2p3.commands.output import counting, say
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from calibration import BoardSpec
     from calibration.closed_forms import Mount
+    from calibration.next_pose import Reachable
+    from dataset.transforms import SE3
 
 _FEWEST_PX_PER_SQUARE = 20
 """Two pixels a marker's cell, or nearly."""
@@ -84,6 +88,7 @@ def intrinsics(
         f"fx {fx:.2f} +- {done.covariance[0, 0] ** 0.5:.2f} px, "
         f"reprojection {done.rms_px:.3f} px, held out {done.held_out_px:.3f} px"
     )
+    _warn(done.warnings)
     _apply(calibration, apply)
 
 
@@ -93,6 +98,7 @@ def hand_eye(
     rig: Path,
     calibration: Path = Path("calibration.json"),
     mount: Literal["eye-in-hand", "eye-to-hand"] = "eye-in-hand",
+    refine_intrinsics: bool = False,
     apply: tuple[Path, ...] = (),
 ) -> None:
     """Estimate where the camera sits on the arm's tool, from stills of the board.
@@ -102,20 +108,26 @@ def hand_eye(
         rig: rig.toml with the [board] table.
         calibration: calibration.json that has the intrinsics; the result is added.
         mount: eye-to-hand: the camera stands beside the arm and the board is on the tool.
+        refine_intrinsics: refine K and distortion with the transforms, from their covariance, and keep them.
         apply: sessions to write the calibration into.
     """
     from calibration.steps import add_hand_eye
 
     kind: Mount = "eye_in_hand" if mount == "eye-in-hand" else "eye_to_hand"
     with counting("detect the board") as report:
-        step = add_hand_eye(session, board_of(rig), calibration, report, kind)
+        reach = _reach(rig, session) if kind == "eye_in_hand" else None
+        step = add_hand_eye(session, board_of(rig), calibration, report, kind, refine_intrinsics, reach)
     done, advice = step.record, step.advice
     say(
         f"hand-eye from {done.views} views: held out {done.held_out_mm:.3f} mm, {done.held_out_deg:.4f} deg;"
         f" 95 % within {step.intervals.half_mm.max():.3f} mm, {step.intervals.half_deg.max():.4f} deg an axis"
     )
-    pose = ", ".join(f"{value:.4f}" for value in advice.T_base_tcp.as_pose6())
-    say(f"next view, the one that would tell most: {advice.reason}; tool at [{pose}] (m, rad) if it is free")
+    _warn(done.warnings)
+    if advice is None:
+        say("next view: none that was tried shows the board within the arm's reach")
+    else:
+        pose = ", ".join(f"{value:.4f}" for value in advice.T_base_tcp.as_pose6())
+        say(f"next view, the one that would tell most: {advice.reason}; tool at [{pose}] (m, rad)")
     _apply(calibration, apply)
 
 
@@ -192,8 +204,7 @@ def polarizer(
         f"orientation +- {math.degrees(done.orientation_sigma_rad):.2f} deg, "
         f"gain +- {100 * done.gain_sigma:.2f} %"
     )
-    for warning in done.warnings:
-        say(f"warning: {warning}")
+    _warn(done.warnings)
     _apply(calibration, apply)
 
 
@@ -236,6 +247,31 @@ def object_pose(
     blind = f"; not observable: {', '.join(done.unobservable)}" if done.unobservable else ""
     say(f"{object} from {done.points} points: {1e3 * done.rms_m:.3f} mm from the surface{blind}")
     _apply(calibration, apply)
+
+
+def _warn(warnings: tuple[str, ...]) -> None:
+    for warning in warnings:
+        say(f"warning: {warning}")
+
+
+def _reach(rig: Path, session: Path) -> Reachable:
+    """Which poses of a session's tool the rig's arm reaches with its camera, within its workspace."""
+    import numpy as np
+
+    from acquisition.planning import configurations
+    from acquisition.rig import Rig
+    from acquisition.routes import carried_camera
+    from dataset.session import Session
+
+    with Session.open(session) as opened:
+        offset = opened.tcp_offset
+    camera = carried_camera(Rig.load(rig), np.zeros(6) if offset is None else offset)
+
+    def reachable(T_base_tcp: SE3) -> NDArray[np.bool_]:
+        joints = configurations(T_base_tcp @ camera.T_tcp_cam, camera)
+        return np.asarray(np.isfinite(joints).any(axis=(1, 2, 3)))
+
+    return reachable
 
 
 def _apply(calibration: Path, sessions: tuple[Path, ...]) -> None:

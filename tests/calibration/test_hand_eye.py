@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibration import remarks
 from calibration.detection import Detection
 from calibration.hand_eye import calibrate_hand_eye
 from calibration.next_pose import next_pose
@@ -63,6 +64,8 @@ def test_views_with_a_wrong_arm_pose_are_left_out_and_named(world):
     translation[[3, 10]] += [[0.02, 0, 0], [0, 0.005, 0]]
     result = calibrate_hand_eye(SE3(arm.rotation, translation), detections, world.spec, world.intrinsics)
     assert list(np.flatnonzero(~result.used)) == [3, 10]
+    (words,) = remarks.of_hand_eye(result, range(22))
+    assert "left out as outliers" in words
     assert translation_error_mm(result.T_tcp_cam, world.T_tcp_cam) < 0.2
 
 
@@ -156,6 +159,10 @@ def test_intrinsics_that_are_off_are_refined_with_the_arm(world):
     assert abs(refined.intrinsics.K[0, 0] / world.intrinsics.K[0, 0] - 1) < 5e-4
     assert translation_error_mm(refined.T_tcp_cam, world.T_tcp_cam) < 0.3
     assert refined.rms_px < fixed.rms_px
+    assert fixed.intrinsics_covariance is None
+    assert refined.intrinsics_covariance.shape == covariance.shape
+    fx_sigma = float(np.sqrt(refined.intrinsics_covariance[0, 0]))
+    assert abs(refined.intrinsics.K[0, 0] - world.intrinsics.K[0, 0]) < 4 * fx_sigma < 2.0
     with pytest.raises(CalibrationError, match="intrinsics_covariance"):
         calibrate_hand_eye(*recording, world.spec, off, refine_camera=True)
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from calibration import remarks
 from calibration.board import BoardSpec
 from calibration.detection import Detection
 from calibration.intrinsics import calibrate_intrinsics
@@ -47,6 +48,8 @@ def test_a_blurred_view_is_left_out_and_named(world):
     detections[4] = Detection(bad.ids, bad.pixels + rng.normal(0, 3.0, bad.pixels.shape))
     result = calibrate_intrinsics(detections, world.spec, SIZE)
     assert list(np.flatnonzero(~result.used)) == [4]
+    words = remarks.of_intrinsics(result, range(100, 115))
+    assert words[0].startswith("left out as outliers, against 0.14 px of the others: frame 104 (")
     assert abs(result.intrinsics.K[0, 0] / world.intrinsics.K[0, 0] - 1) < 2e-3
 
 
@@ -106,12 +109,42 @@ def test_the_views_selected_cover_more_than_as_many_in_a_row(world):
     assert list(select_views(crowded[:5], world.spec, 8)) == list(range(5))
 
 
-def test_a_board_described_with_another_aspect_is_refused(world):
-    """Squares that are not square, as a printer's fit to the page makes them."""
-    stretched = [Detection(d.ids, d.pixels) for d in _views(world, 5)]
+def test_a_board_of_other_counts_is_refused(world):
     wrong = BoardSpec(12, 8, world.spec.square_m, world.spec.marker_m, "DICT_5X5_100")
     with pytest.raises(CalibrationError, match="squares_x"):
-        calibrate_intrinsics(stretched, wrong, SIZE)
+        calibrate_intrinsics(_views(world, 5), wrong, SIZE)
+
+
+def _stretched(world, aspect, turned):
+    """Views of a board whose squares are that much higher than wide, turned in the picture or upright."""
+    rng = np.random.default_rng(5)
+    views = world.views(10, rng)
+    if not turned:
+        centre = SE3(np.eye(3), -0.5 * np.array([*world.spec.size_m, 0.0]))
+        tilts = np.column_stack([rng.normal(0, 0.3, (10, 2)), np.zeros(10)])
+        views = SE3.from_rotvec(tilts, rng.uniform([-0.1, -0.08, 0.4], [0.1, 0.08, 0.65], (10, 3))) @ centre
+    corners = world.spec.object_points(np.arange(world.spec.corner_count)) * [1.0, aspect, 1.0]
+    found = []
+    for pose in views:
+        pixels = world.intrinsics.project(pose.apply(corners))
+        inside = np.flatnonzero(np.all((pixels > 5) & (pixels < np.array(SIZE[::-1]) - 6), axis=1))
+        found.append(Detection(inside, pixels[inside] + rng.normal(0, 0.1, (len(inside), 2))))
+    return found
+
+
+@pytest.mark.parametrize("turned", [True, False])
+def test_squares_that_are_not_square_are_refused(world, turned):
+    """As a printer's fit to the page makes them: no lens does that, nor do a sensor's pixels."""
+    with pytest.raises(CalibrationError, match=r"1\.020 times as high as wide; it was stretched"):
+        calibrate_intrinsics(_stretched(world, 1.02, turned), world.spec, SIZE)
+
+
+def test_squares_that_are_nearly_square_are_told(world):
+    result = calibrate_intrinsics(_stretched(world, 1.004, True), world.spec, SIZE)
+    assert result.board_aspect == pytest.approx(1.004, abs=5 * result.board_aspect_sigma)
+    assert result.board_aspect_sigma < 5e-4
+    words = remarks.of_intrinsics(result, range(10))
+    assert f"{result.board_aspect:.4f} times as high as wide" in words[0]
 
 
 def test_corners_that_are_nan_are_refused_by_view(world):

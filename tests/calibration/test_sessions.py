@@ -15,7 +15,7 @@ from calibration import (
     hand_eye_from_session,
     intrinsics_from_session,
 )
-from calibration.report import ViewPicture, calibration_report
+from calibration.report import ViewPicture, hand_eye_report, intrinsics_report
 from calibration.sessions import arm_trace, rest_pose
 from calibration.touches import KnownTip, read_points, touched_points
 from dataset.errors import CalibrationError
@@ -120,8 +120,12 @@ def test_the_report_is_one_file_with_pictures_first(world, stills, calibrated):
     camera, _, hand_eye = calibrated
     with Session.open(stills[0]) as session:
         shown = [ViewPicture(session.raw(0), session.camera.mosaic, 0)]
-    page = calibration_report(world.spec, camera, hand_eye, pictures=shown)
-    assert "data:image/" in page
-    assert "http" not in page.replace("http://www.w3.org/2000/svg", "")
-    first_picture, first_number = page.index("<svg"), page.index('<div class="tiles"')
-    assert first_picture < first_number
+    frames = range(len(stills[1]))
+    for page in (
+        intrinsics_report(world.spec, camera, frames, shown),
+        hand_eye_report(world.spec, hand_eye, frames, shown),
+    ):
+        assert "data:image/" in page
+        assert "http" not in page.replace("http://www.w3.org/2000/svg", "")
+        first_picture, first_number = page.index("<svg"), page.index('<div class="tiles"')
+        assert first_picture < first_number

@@ -3,6 +3,7 @@
 import base64
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,11 +13,13 @@ import pytest
 
 from calibration import Calibration
 from calibration.detection import detect
-from calibration.sessions import detect_session, views_at_rest
-from calibration.steps import add_hand_eye, add_intrinsics, report_path
+from calibration.records import FixedCameraRecord, HandEyeRecord, TimeOffsetRecord, ToolTipRecord
+from calibration.sessions import arm_trace, detect_session, views_at_rest
+from calibration.steps import add_hand_eye, add_intrinsics, add_time_offset, report_path
+from dataset.errors import CalibrationError
 from dataset.session import Session
 from dataset.session.seals import leave_open, seal
-from dataset.transforms import translation_error_mm
+from dataset.transforms import SE3, translation_error_mm
 
 _SHAKEN = 2
 
@@ -49,11 +52,85 @@ def overlays(page: str) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def test_a_view_taken_in_motion_is_skipped_and_every_overlay_shows_its_own_view(
-    world, stills, shaken: Path, tmp_path: Path
+@pytest.fixture(scope="module")
+def known(world, stills, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A calibration.json that held everything when the intrinsics were calibrated once more."""
+    path = tmp_path_factory.mktemp("known") / "calibration.json"
+    still = SE3.identity()
+    Calibration(
+        tool_tip=ToolTipRecord(np.zeros(3), np.eye(3), 1e-4, 12, 0, np.zeros(6), ()),
+        fixed_camera=FixedCameraRecord(still, still, np.eye(12), 0.1, 0.1, 0.01, 1e-5, 1e-5, 20, ()),
+        time_offset=TimeOffsetRecord(0.03, 1e-4, 0.1, ()),
+    ).save(path)
+    add_intrinsics(stills[0], world.spec, path)
+    return path
+
+
+def copied(known: Path, folder: Path) -> Path:
+    return Path(shutil.copy(known, folder / "calibration.json"))
+
+
+def test_new_intrinsics_take_away_what_hung_on_the_old_ones(known: Path) -> None:
+    found = Calibration.load(known)
+    assert found.intrinsics is not None
+    assert found.tool_tip is not None
+    assert found.hand_eye is None
+    assert found.fixed_camera is None
+    assert found.time_offset is None
+
+
+def test_pictures_of_another_resolution_are_refused(world, stills, known: Path, tmp_path: Path) -> None:
+    calibration = copied(known, tmp_path)
+    before = Calibration.load(calibration)
+    assert before.intrinsics is not None
+    halved = replace(before.intrinsics, intrinsics=before.intrinsics.intrinsics.at(2))
+    replace(before, intrinsics=halved).save(calibration)
+    with pytest.raises(CalibrationError, match="2448x2048 pixels, the intrinsics are for 1224x1024"):
+        add_hand_eye(stills[0], world.spec, calibration)
+
+
+def test_another_board_than_hand_eyes_is_refused_for_the_clocks(
+    world, stills, known: Path, tmp_path: Path
 ) -> None:
-    calibration = tmp_path / "calibration.json"
-    add_intrinsics(stills[0], world.spec, calibration)
+    calibration = copied(known, tmp_path)
+    placed = HandEyeRecord(
+        world.T_tcp_cam, world.T_base_board, np.eye(12), 0.1, 0.1, 0.01, 1e-5, 1e-5, 20, ()
+    )
+    replace(Calibration.load(calibration), hand_eye=placed).save(calibration)
+    with pytest.raises(CalibrationError, match="calibrated with another board"):
+        add_time_offset(stills[0], replace(world.spec, square_m=0.031), calibration)
+
+
+def test_a_trace_with_nan_is_refused(stills, tmp_path: Path) -> None:
+    path = Path(shutil.copy(stills[0], tmp_path / "nan.h5"))
+    with h5py.File(path, "r+") as file:
+        file["robot/pose"][300:310] = np.nan
+        leave_open(file["robot/pose"])
+        seal(file)
+    with Session.open(path) as session, pytest.raises(CalibrationError, match=r"in 10 of .* sample 300"):
+        arm_trace(session)
+
+
+def test_refined_intrinsics_are_kept_and_their_own_pictures_do_not_count_twice(
+    world, stills, known: Path, tmp_path: Path
+) -> None:
+    calibration = copied(known, tmp_path)
+    before = Calibration.load(calibration).intrinsics
+    add_hand_eye(stills[0], world.spec, calibration, refine_camera=True)
+    found = Calibration.load(calibration)
+    assert found.hand_eye is not None
+    assert translation_error_mm(found.hand_eye.T_tcp_cam, world.T_tcp_cam) < 0.5
+    after = found.intrinsics
+    assert after.sources == before.sources
+    assert after.intrinsics.K[0, 0] != before.intrinsics.K[0, 0]
+    ratio = np.sqrt(after.covariance[0, 0] / before.covariance[0, 0])
+    assert ratio > 0.75  # 0.71 if the pictures counted twice; the arm's poses add little
+
+
+def test_a_view_taken_in_motion_is_skipped_and_every_overlay_shows_its_own_view(
+    world, shaken: Path, known: Path, tmp_path: Path
+) -> None:
+    calibration = copied(known, tmp_path)
     record = add_hand_eye(shaken, world.spec, calibration).record
     with Session.open(shaken) as session:
         views, _ = views_at_rest(session, detect_session(session, world.spec))

@@ -96,41 +96,40 @@ def compare(data: Path) -> dict[str, Any]:
     """Medians a track over a generated tier."""
     ours: dict[str, list[tuple[float, float]]] = defaultdict(list)
     references: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
-    refused: dict[str, int] = defaultdict(int)
-    fooled: dict[str, int] = defaultdict(int)
-    total: dict[str, int] = defaultdict(int)
+    refused: dict[str, int] = {}
+    fooled: dict[str, int] = {}
     for sequence in kinhec.iter_sequences(data):
         track = sequence.manifest["track"]
-        total[track] += 1
+        refused.setdefault(track, 0)
+        fooled.setdefault(track, 0)
         try:
             result = solve(sequence)
         except CalibrationError as reason:
             refused[track] += 1
             print(f"{sequence.id}: {reason}", file=sys.stderr)
             continue
-        fooled[track] += sequence.manifest["axis_scatter_lambda2"] < DEGENERATE
+        fooled[track] += int(sequence.manifest["axis_scatter_lambda2"] < DEGENERATE)
         ours[track].append(errors(sequence, result))
         for name, error in reference_errors(sequence).items():
             references[track][name].append(error)
     return {
         track: {
-            **_named("ours", np.median(ours[track], axis=0)),
-            **_named("best_reference", _best(list(references[track].values()))),
-            "refused": refused[track],
-            "accepted_degenerate": int(fooled[track]),
-            "sequences": total[track],
+            **_medians("ours", [ours[track]]),
+            **_medians("best_reference", list(references[track].values())),
+            "refused": count,
+            "accepted_degenerate": fooled[track],
         }
-        for track in total
-        if ours[track]
+        for track, count in refused.items()
     }
 
 
-def _best(solvers: list[list[tuple[float, float]]]) -> np.ndarray:
-    return np.min([np.median(errors, axis=0) for errors in solvers], axis=0)
-
-
-def _named(whose: str, pair: np.ndarray) -> dict[str, float]:
-    return {f"{whose}_deg": round(float(pair[0]), 4), f"{whose}_mm": round(float(pair[1]), 3)}
+def _medians(whose: str, solvers: list[list[tuple[float, float]]]) -> dict[str, float | None]:
+    """The best of the solvers' medians in each number; None where every sequence was refused."""
+    medians = [np.median(errors, axis=0) for errors in solvers if errors]
+    if not medians:
+        return {f"{whose}_deg": None, f"{whose}_mm": None}
+    degrees, millimetres = np.min(medians, axis=0)
+    return {f"{whose}_deg": round(float(degrees), 4), f"{whose}_mm": round(float(millimetres), 3)}
 
 
 def main() -> None:
@@ -149,9 +148,9 @@ def main() -> None:
         return
     for track, row in found.items():
         print(
-            f"{track:12} ours {row['ours_deg']:8.4f} deg {row['ours_mm']:8.3f} mm   best reference"
-            f" {row['best_reference_deg']:8.4f} deg {row['best_reference_mm']:8.3f} mm   refused"
-            f" {row['refused']} of {row['sequences']}, degenerate accepted {row['accepted_degenerate']}"
+            f"{track:12} ours {row['ours_deg']} deg {row['ours_mm']} mm, best reference"
+            f" {row['best_reference_deg']} deg {row['best_reference_mm']} mm, refused {row['refused']},"
+            f" degenerate accepted {row['accepted_degenerate']}"
         )
 
 

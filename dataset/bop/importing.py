@@ -7,13 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dataset.bop.layout import EXTRA, MM, decode_stokes, read_image, read_json
+from dataset.bop.layout import EXTRA, MM, decode_stokes, read_image, read_json, tables_of
 from dataset.bop.models import read_models
 from dataset.errors import ToolkitError
 from dataset.importers.mosaics import stokes_mosaic
-from dataset.importers.target import Imported, ImportedObject, mosaic_intrinsics, sensor, write_imported
+from dataset.importers.target import (
+    Imported,
+    ImportedObject,
+    ReadWhenAsked,
+    annotated,
+    mosaic_intrinsics,
+    sensor,
+    write_imported,
+)
 from dataset.polarimetry import Raw
+from dataset.session import ObjectRecord
 from dataset.transforms import SE3
 
 _BITS = 16
@@ -38,6 +48,18 @@ def import_bop(scene: str | Path, out: str | Path) -> int:
         SessionError: the session exists.
     """
     scene = Path(scene)
+    with tables_of(scene):
+        imported, ids = _described(scene)
+
+    def mosaics() -> Iterator[Raw]:
+        for image in ids:
+            yield stokes_mosaic(decode_stokes(read_image(_stokes_file(scene, image))), _BITS)
+
+    return write_imported(out, imported, mosaics())
+
+
+def _described(scene: Path) -> tuple[Imported, list[str]]:
+    """All but the mosaics, and the ids of the images."""
     root = scene.parent.parent
     cameras: dict[str, Any] = read_json(scene / "scene_camera.json")
     truth, infos = read_json(scene / "scene_gt.json"), read_json(scene / "scene_gt_info.json")
@@ -57,18 +79,10 @@ def import_bop(scene: str | Path, out: str | Path) -> int:
             f"{scene}: its images have different cam_K, a session has one camera; split the scene"
         )
     height, width = read_image(_stokes_file(scene, ids[0])).shape[:2]
-
-    def mosaics() -> Iterator[Raw]:
-        for image in ids:
-            yield stokes_mosaic(decode_stokes(read_image(_stokes_file(scene, image))), _BITS)
-
     depth = None
     if (scene / "depth").is_dir():
         scales = [float(cameras[image].get("depth_scale", 1.0)) for image in ids]
-        depth = [
-            np.rint(read_image(scene / "depth" / f"{int(image):06d}.png") * scale).astype(np.uint16)
-            for image, scale in zip(ids, scales, strict=True)
-        ]
+        depth = ReadWhenAsked(len(ids), lambda row: _depth(scene, ids[row], scales[row]))
     objects = [
         _object(scene, object_id, record, ids, truth, infos, (height, width))
         for object_id, record in records.items()
@@ -82,17 +96,23 @@ def import_bop(scene: str | Path, out: str | Path) -> int:
         depth=depth,
         origin=f"BOP scene {scene.resolve().parent.parent.name}/{scene.parent.name}/{scene.name}",
     )
-    return write_imported(out, imported, mosaics())
+    return imported, ids
 
 
 def _stokes_file(scene: Path, image: str) -> Path:
     return scene / "stokes" / f"{int(image):06d}.png"
 
 
+def _depth(scene: Path, image: str, scale: float) -> NDArray[np.uint16]:
+    """Millimetres."""
+    counts = read_image(scene / "depth" / f"{int(image):06d}.png")
+    return np.clip(np.rint(counts * scale), 0, 65535).astype(np.uint16)
+
+
 def _object(
     scene: Path,
     object_id: int,
-    record: Any,
+    record: ObjectRecord,
     ids: list[str],
     truth: dict[str, Any],
     infos: dict[str, Any],
@@ -100,7 +120,7 @@ def _object(
 ) -> ImportedObject:
     matrices = np.full((len(ids), 4, 4), np.nan)
     fractions = np.zeros(len(ids))
-    masks = np.zeros((len(ids), *size), dtype=bool)
+    files: list[Path | None] = [None] * len(ids)
     for row, image in enumerate(ids):
         found = [index for index, entry in enumerate(truth[image]) if entry["obj_id"] == object_id]
         if len(found) > 1:
@@ -114,8 +134,13 @@ def _object(
             matrices[row, :3, :3] = np.array(entry["cam_R_m2c"]).reshape(3, 3)
             matrices[row, :3, 3] = np.array(entry["cam_t_m2c"]) / MM
             fractions[row] = infos[image][index]["visib_fract"]
-            masks[row] = read_image(scene / "mask_visib" / f"{int(image):06d}_{index:06d}.png") > 0
-    return ImportedObject(record, SE3.from_matrix(matrices), fractions, masks)
+            files[row] = scene / "mask_visib" / f"{int(image):06d}_{index:06d}.png"
+
+    def mask(row: int) -> NDArray[np.bool_]:
+        file = files[row]
+        return np.zeros(size, dtype=bool) if file is None else read_image(file) > 0
+
+    return annotated(record, matrices, ReadWhenAsked(len(ids), mask), fractions)
 
 
 def _base(cameras: dict[str, Any], ids: list[str]) -> SE3 | None:

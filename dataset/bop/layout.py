@@ -7,6 +7,8 @@ has no place for, polarization and materials, is in the folder `stokes` beside `
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +93,19 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, UnicodeDecodeError) as error:
         raise ToolkitError(f"{path} is not JSON ({error}); copy it again from its source") from error
+
+
+@contextmanager
+def tables_of(folder: Path) -> Iterator[None]:
+    """Turns what tables of another shape than the format's provoke into a ToolkitError that names the folder
+    they are in."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise ToolkitError(
+            f"{folder}: its JSON tables are not of the format ({type(error).__name__}: {error}); "
+            "check them, or export them again"
+        ) from error
 
 
 def model_file(folder: Path, object_id: int) -> Path:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from dataset.importers.mosaics import colour_mosaic
 from dataset.importers.plain_pickle import read_plain_pickle
 from dataset.importers.target import (
     Imported,
-    ImportedObject,
+    ReadWhenAsked,
     annotated,
     mosaic_intrinsics,
     sensor,
@@ -86,17 +87,18 @@ def import_housecat6d(
     labels = [read_plain_pickle(scene / "labels" / f"{number:06d}_label.pkl") for number in numbers]
     first = _angles(scene, numbers[0])
     height, width = first.shape[1:3]
-    numbered = [read_image(scene / "instance" / f"{number:06d}.png") for number in numbers]
-    numbered = [image if image.ndim == 2 else image[..., 0] for image in numbered]
+    seen = [set(np.unique(_numbered(scene, number)).tolist()) for number in numbers]
     objects = []
     for instance in instances:
         matrices = _poses(scene, labels, instance, UNITS[pose_units])
         check_distances(instance.name, matrices[:, :3, 3])
-        masks = np.stack([image == instance.number for image in numbered])
-        objects.append(_object(folder, instance, mesh_units, matrices, masks))
+        # the labels do not say how much is hidden: 1 where anything is seen (our choice)
+        fractions = np.array([float(instance.number in found) for found in seen])
+        masks = ReadWhenAsked(len(numbers), partial(_mask, scene, numbers, instance.number))
+        objects.append(annotated(_record(folder, instance, mesh_units), matrices, masks, fractions))
     depth = None
     if (scene / "depth").is_dir():
-        depth = [read_image(scene / "depth" / f"{number:06d}.png").astype(np.uint16) for number in numbers]
+        depth = ReadWhenAsked(len(numbers), lambda row: _depth(scene, numbers[row]))
     try:
         matrix = np.loadtxt(scene / "intrinsics.txt").reshape(3, 3)
     except (OSError, ValueError) as error:
@@ -137,6 +139,20 @@ def _angles(scene: Path, number: int) -> NDArray[np.uint8]:
     return np.stack(images)
 
 
+def _numbered(scene: Path, number: int) -> NDArray[np.uint8]:
+    """(h, w) the number of the instance that each pixel shows, 0 where none."""
+    image: NDArray[np.uint8] = read_image(scene / "instance" / f"{number:06d}.png")
+    return image if image.ndim == 2 else image[..., 0]
+
+
+def _mask(scene: Path, numbers: list[int], instance: int, row: int) -> NDArray[np.bool_]:
+    return np.asarray(_numbered(scene, numbers[row]) == instance)
+
+
+def _depth(scene: Path, number: int) -> NDArray[np.uint16]:
+    return read_image(scene / "depth" / f"{number:06d}.png").astype(np.uint16)
+
+
 def _instances(path: Path) -> list[_Instance]:
     if not path.is_file():
         raise ToolkitError(f"{path} is missing; check that the folder is complete")
@@ -161,12 +177,8 @@ def _poses(
     return matrices
 
 
-def _object(
-    folder: Path, instance: _Instance, unit: Unit, matrices: NDArray[np.float64], masks: NDArray[np.bool_]
-) -> ImportedObject:
+def _record(folder: Path, instance: _Instance, unit: Unit) -> ObjectRecord:
     vertices, faces = read_mesh(folder / instance.kind / f"{instance.name}.obj", UNITS[unit])
     check_mesh(instance.name, vertices)
     material, index = _MATERIALS.get(instance.kind, ("plastic", 1.5))
-    record = ObjectRecord(instance.name, vertices, faces, material, index, 0.0, "{}", widest(vertices))
-    # the labels do not say how much is hidden: 1 where anything is seen (our choice)
-    return annotated(record, matrices, masks, np.asarray(masks.any(axis=(1, 2)), np.float64))
+    return ObjectRecord(instance.name, vertices, faces, material, index, 0.0, "{}", widest(vertices))

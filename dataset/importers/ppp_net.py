@@ -15,11 +15,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataset.bop.layout import read_image, read_json
+from dataset.bop.layout import read_image, read_json, tables_of
 from dataset.errors import ToolkitError
 from dataset.importers.meshes import read_mesh, widest
 from dataset.importers.mosaics import colour_mosaic
-from dataset.importers.target import Imported, annotated, mosaic_intrinsics, sensor, write_imported
+from dataset.importers.target import (
+    Imported,
+    ImportedObject,
+    ReadWhenAsked,
+    annotated,
+    mosaic_intrinsics,
+    sensor,
+    write_imported,
+)
 from dataset.importers.units import UNITS, Unit, check_distances, check_mesh
 from dataset.polarimetry import ANGLES_DEG, Raw
 from dataset.session import ObjectRecord
@@ -68,26 +76,17 @@ def import_ppp_net(
         symmetry=_symmetry(name),
         diameter=widest(vertices),
     )
-    truth, infos = read_json(folder / "scene_gt.json"), read_json(folder / "scene_gt_info.json")
-    height, width = _angles(folder, numbers[0]).shape[1:3]
-    matrices = np.full((len(numbers), 4, 4), np.nan)
-    fractions, masks = np.zeros(len(numbers)), np.zeros((len(numbers), height, width), dtype=bool)
-    for row, number in enumerate(numbers):
-        entry, info = _first(truth, number), _first(infos, number)
-        if entry is None:
-            continue
-        matrices[row] = np.eye(4)
-        matrices[row, :3, :3] = np.reshape(entry["cam_R_m2c"], (3, 3))
-        matrices[row, :3, 3] = np.ravel(entry["cam_t_m2c"]) * UNITS[pose_units]
-        masks[row] = _mask(folder, number, (height, width))
-        fractions[row] = 1.0 if info is None else min(1.0, float(info.get("visib_fract", 1.0)))
-    check_distances(name, matrices[:, :3, 3])
+    size = _angles(folder, numbers[0]).shape[1:3]
+    with tables_of(folder):
+        found = _annotation(folder, record, numbers, size, UNITS[pose_units])
+        matrix = _matrix(folder, numbers[0], size)
+    check_distances(name, found.T_cam_obj.translation)
     imported = Imported(
-        camera=sensor("colour", _LEVEL * height, _LEVEL * width, 8),
-        intrinsics=mosaic_intrinsics(_matrix(folder, numbers[0], (height, width)), _LEVEL, height, width),
+        camera=sensor("colour", _LEVEL * size[0], _LEVEL * size[1], 8),
+        intrinsics=mosaic_intrinsics(matrix, _LEVEL, *size),
         frame_ids=np.array(numbers),
         origin=f"PPP-Net data, object {name}",
-        objects=[annotated(record, matrices, masks, fractions)],
+        objects=[found],
         splits=_splits(folder, numbers),
     )
 
@@ -105,6 +104,29 @@ def _angles(folder: Path, number: int) -> NDArray[np.uint8]:
     return np.stack(images)
 
 
+def _annotation(
+    folder: Path, record: ObjectRecord, numbers: list[int], size: tuple[int, int], unit: float
+) -> ImportedObject:
+    truth, infos = read_json(folder / "scene_gt.json"), read_json(folder / "scene_gt_info.json")
+    matrices, fractions = np.full((len(numbers), 4, 4), np.nan), np.zeros(len(numbers))
+    masks: list[Path | None] = [None] * len(numbers)
+    for row, number in enumerate(numbers):
+        entry, info = _first(truth, number), _first(infos, number)
+        if entry is None:
+            continue
+        matrices[row] = np.eye(4)
+        matrices[row, :3, :3] = np.reshape(entry["cam_R_m2c"], (3, 3))
+        matrices[row, :3, 3] = np.ravel(entry["cam_t_m2c"]) * unit
+        masks[row] = _mask_file(folder, number)
+        fractions[row] = 1.0 if info is None else min(1.0, float(info.get("visib_fract", 1.0)))
+
+    def mask(row: int) -> NDArray[np.bool_]:
+        path = masks[row]
+        return np.zeros(size, dtype=bool) if path is None else _mask(path, size)
+
+    return annotated(record, matrices, ReadWhenAsked(len(numbers), mask), fractions)
+
+
 def _first(table: dict[str, Any], number: int) -> dict[str, Any] | None:
     entries = table.get(str(number)) or []
     if len(entries) > 1:
@@ -114,16 +136,20 @@ def _first(table: dict[str, Any], number: int) -> dict[str, Any] | None:
     return entries[0] if entries else None
 
 
-def _mask(folder: Path, number: int, size: tuple[int, int]) -> NDArray[np.bool_]:
+def _mask_file(folder: Path, number: int) -> Path:
     found = sorted((folder / "mask_visib").glob(f"{number:06d}*.png"))
     if len(found) != 1:
         raise ToolkitError(
             f"{folder}/mask_visib holds {len(found)} masks of image {number:06d}, expected one"
         )
-    mask = read_image(found[0])
+    return found[0]
+
+
+def _mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    mask = read_image(path)
     mask = mask if mask.ndim == 2 else mask.max(axis=2)
     if mask.shape != size:
-        raise ToolkitError(f"{found[0]} is {mask.shape}, the images are {size}")
+        raise ToolkitError(f"{path} is {mask.shape}, the images are {size}")
     inside: NDArray[np.bool_] = mask > 0
     return inside
 

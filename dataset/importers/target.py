@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Generic
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +24,7 @@ from dataset.session import (
     write_split,
 )
 from dataset.session.edit import write_depth, write_origin
+from dataset.session.records import Image, Images, Masks
 from dataset.subset import check_new
 from dataset.transforms import SE3
 
@@ -35,13 +37,32 @@ class ImportedObject:
         record: mesh and material.
         T_cam_obj: a batch of N, NaN where unknown.
         visible_fraction: (N,) in [0, 1].
-        masks: N visible masks (h, w) bool, or a (N, h, w) array.
+        masks: N visible masks (h, w) bool.
     """
 
     record: ObjectRecord
     T_cam_obj: SE3
     visible_fraction: NDArray[np.float64]
-    masks: Sequence[NDArray[np.bool_]] | NDArray[np.bool_]
+    masks: Masks
+
+
+@dataclass(frozen=True)
+class ReadWhenAsked(Generic[Image]):
+    """N images that are read one at a time: a data set need not fit into memory.
+
+    Attributes:
+        count: N.
+        read: reads one by its index.
+    """
+
+    count: int
+    read: Callable[[int], Image]
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int, /) -> Image:
+        return self.read(index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +108,7 @@ class Imported:
     origin: str
     objects: Sequence[ImportedObject] = ()
     T_base_cam: SE3 | None = None
-    depth: Sequence[NDArray[np.uint16]] | None = None
+    depth: Images[NDArray[np.uint16]] | None = None
     stamps: Stamps | None = None
     splits: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
@@ -129,7 +150,7 @@ def mosaic_intrinsics(K: ArrayLike, level: int, height: int, width: int) -> Intr
 def annotated(
     record: ObjectRecord,
     matrices: NDArray[np.float64],
-    masks: NDArray[np.bool_],
+    masks: Masks,
     fractions: NDArray[np.float64],
 ) -> ImportedObject:
     """An object from (N, 4, 4) poses whose rotations other tools may have stored with few digits."""
@@ -175,7 +196,7 @@ def _write(path: Path, imported: Imported, mosaics: Iterable[Raw]) -> None:
             found.record.name: ObjectPoses(
                 found.T_cam_obj,
                 found.visible_fraction,
-                np.stack([mask_box(m) for m in found.masks]),
+                np.stack([mask_box(found.masks[index]) for index in range(count)]),
                 found.masks,
             )
             for found in imported.objects

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import h5py
@@ -18,7 +18,7 @@ from dataset.intrinsics import Intrinsics
 from dataset.polarizer_response import PolarizerResponse
 from dataset.schema import Dataset, checksums_of, declaration
 from dataset.session.files import dtype_of, make_dataset, open_for_editing
-from dataset.session.records import ObjectPoses, ObjectRecord
+from dataset.session.records import Image, Images, ObjectPoses, ObjectRecord
 from dataset.session.seals import leave_open
 from dataset.transforms import SE3
 
@@ -155,7 +155,7 @@ def write_origin(path: str | Path, origin: str) -> None:
         leave_open(file)
 
 
-def write_depth(path: str | Path, images: Sequence[NDArray[np.uint16]]) -> None:
+def write_depth(path: str | Path, images: Images[NDArray[np.uint16]]) -> None:
     """Stores the depth of every frame, replacing an earlier one.
 
     Args:
@@ -171,12 +171,10 @@ def write_depth(path: str | Path, images: Sequence[NDArray[np.uint16]]) -> None:
         height, width = _mosaic_size(file)
         shape = (len(file["camera/raw"]), height // block, width // block)
         _require(path, "depth", (len(images), *shape[1:]), shape)
-        for index, image in enumerate(images):
-            _require(path, f"depth {index}", image.shape, shape[1:])
         for name in ("depth", "depth_crc32"):
             if name in file:
                 del file[name]
-        store_images(file, declaration("depth"), images, shape, np.uint16)
+        store_images(file, declaration("depth"), _of_size(path, "depth", images, shape[1:]), shape, np.uint16)
 
 
 def store_intrinsics(file: h5py.File, intrinsics: Intrinsics) -> None:
@@ -251,13 +249,17 @@ def _store_object_poses(file: h5py.File, path: Path, name: str, poses: ObjectPos
     size = (height // block, width // block)
     count = len(poses.masks)
 
-    def masks() -> Iterator[NDArray[np.uint8]]:
-        for index in range(count):
-            mask = poses.mask(index)
-            _require(path, f"mask {index} of {name}", mask.shape, size)
-            yield mask.view(np.uint8)
+    masks = (np.asarray(mask, dtype=bool) for mask in _of_size(path, f"mask of {name}", poses.masks, size))
+    bytes_ = (mask.view(np.uint8) for mask in masks)
+    store_images(file, declaration("poses/objects/*/mask"), bytes_, (count, *size), np.uint8, name)
 
-    store_images(file, declaration("poses/objects/*/mask"), masks(), (count, *size), np.uint8, name)
+
+def _of_size(path: Path, what: str, images: Images[Image], size: tuple[int, int]) -> Iterator[Image]:
+    """The images, one after another. Raises SessionError: one is of another size."""
+    for index in range(len(images)):
+        image = images[index]
+        _require(path, f"{what} in frame {index}", image.shape, size)
+        yield image
 
 
 def _matrices(poses: SE3) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,19 @@ from numpy.typing import NDArray
 from dataset.clocks import DeviceClock
 from dataset.transforms import SE3
 
+Image = TypeVar("Image", bound=NDArray[np.generic], covariant=True)
 
-class Masks(Protocol):
-    """N visible masks, read one at a time: a (N, h, w) array, a list of images, or masks in a file."""
+
+class Images(Protocol[Image]):
+    """N images, read one at a time: a (N, h, w) array, a list of images, or images in a file."""
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, index: int, /) -> NDArray[np.bool_]: ...
+    def __getitem__(self, index: int, /) -> Image: ...
+
+
+Masks = Images[NDArray[np.bool_]]
+"""N visible masks, each (h, w) bool."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -168,6 +168,10 @@ def test_mistakes_get_one_line(recorded: Path, exported: Path, tmp_path: Path) -
     scene = exported / "test" / "000000"
     with pytest.raises(SessionError, match="already exists"):
         import_bop(scene, recorded)
+    (scene / "scene_gt.json").write_text('{"9": [{"obj_id": "cup"}], "10": 3}')
+    with pytest.raises(ToolkitError, match="JSON tables are not of the format"):
+        import_bop(scene, tmp_path / "a.h5")
+    (scene / "scene_gt.json").write_text("{}")
     for path in (scene / "stokes").iterdir():
         path.unlink()
     with pytest.raises(ToolkitError, match=r"000009\.png is missing"):

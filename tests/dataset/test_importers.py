@@ -135,6 +135,8 @@ def test_ppp_net_without_its_files_is_refused(ppp_net: Path, tmp_path: Path) -> 
     (ppp_net / "pol" / "000004_90.png").unlink()
     (ppp_net / "scene_camera.json").unlink()
     refused("published intrinsics are for 612x512|masks")
+    (ppp_net / "scene_gt.json").write_text('{"3": [{"cam_R_m2c": [1, 2]}]}')
+    refused("JSON tables are not of the format")
     (ppp_net / "scene_gt.json").unlink()
     refused("scene_gt.json is missing")
 

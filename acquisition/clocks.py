@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from dataset.clocks import DeviceClock
 from dataset.session import Clocks
 
-_DOUBTFUL_NS = 400_000.0
-"""Our choice: 0.1 mm at 0.25 m/s."""
+DOUBTFUL_NS = 400_000.0
+"""A clock that is followed less closely is in doubt (our choice: 0.1 mm at 0.25 m/s)."""
+
 _SPEED_MM_MS = 0.25
 
 
@@ -28,7 +29,7 @@ def _warnings(name: str, clock: DeviceClock, moving: bool) -> Iterator[str]:
     for row in clock.restarts:
         what = "frame" if name == "camera" else "sample"
         yield f"the {name}'s clock jumped or started anew at {what} {row}; it is fitted apart on either side"
-    if moving and clock.sigma_ns > _DOUBTFUL_NS:
+    if moving and clock.sigma_ns > DOUBTFUL_NS:
         sigma_ms = clock.sigma_ns * 1e-6
         yield (
             f"the {name}'s clock is followed to {sigma_ms:.2g} ms only, {sigma_ms * _SPEED_MM_MS:.2g} mm at "

@@ -40,6 +40,7 @@ FEWEST_SAMPLES = 5
 ARRIVAL_SIGMA_NS = 5e6
 """How late a single arrival may be on a busy host (our choice)."""
 
+_BUSY_NS = 1_000_000_000  # our choice: the latest that a host which stood still explains an arrival
 _JUMP_NS = 200_000_000  # our choice: what a busy host explains less well than a clock that was set
 _JUMP_NEIGHBOURS = 30
 
@@ -159,12 +160,16 @@ def _fit_run(device: Times, host: Times) -> tuple[list[int], list[ClockFit]]:
     span_ns = int(device[-1]) - int(device[0])
     lateness = ((host - host[0]) - (device - device[0])).astype(np.float64)  # ns; small, so exact as a float
     offset_ns = int(host[0]) - int(device[0])
+    unknown = [
+        ClockFit(float(offset_ns + lateness.min()), 1.0, max(ARRIVAL_SIGMA_NS, float(np.ptp(lateness))))
+    ]
     if len(device) < FEWEST_SAMPLES or span_ns == 0:
-        sigma = max(ARRIVAL_SIGMA_NS, float(np.ptp(lateness)))
-        return [0], [ClockFit(float(offset_ns + lateness.min()), 1.0, sigma)]
+        return [0], unknown
     span_ratio = float(host[-1] - host[0]) / span_ns
     if not 1 / _LARGEST_SPAN_RATIO < span_ratio < _LARGEST_SPAN_RATIO:
-        raise _other_unit(span_ratio)
+        if abs(lateness[-1]) > _BUSY_NS:
+            raise _other_unit(span_ratio)
+        return [0], unknown
     elapsed = (device - device[0]) * 1e-9
     pieces = max(1, round(elapsed[-1] / _PIECE_S))
     times, earliest = _window_minima(elapsed, lateness, max(_MOST_WINDOWS, pieces * _WINDOWS_PER_PIECE))
@@ -172,7 +177,9 @@ def _fit_run(device: Times, host: Times) -> tuple[list[int], list[ClockFit]]:
     values = _lower_chain(times, earliest, knots)
     slopes = np.diff(values) / np.diff(knots)
     if np.abs(slopes).max() > _LARGEST_RATE_ERROR * 1e9:
-        raise _other_unit(1 + slopes[np.argmax(np.abs(slopes))] * 1e-9)
+        if np.ptp(values) > _BUSY_NS:
+            raise _other_unit(1 + slopes[np.argmax(np.abs(slopes))] * 1e-9)
+        return [0], unknown
     heights = earliest - np.interp(times, knots, values)
     first, fits = [], []
     for index, slope in enumerate(slopes):

@@ -6,6 +6,7 @@ from html import escape
 
 import numpy as np
 
+from acquisition.clocks import DOUBTFUL_NS
 from acquisition.console.feeds import Feed
 from acquisition.console.recording import Recording
 from acquisition.console.station import Station
@@ -107,7 +108,7 @@ def notice(text: str) -> str:
 
 
 def _clock(feed: Feed) -> tuple[str | None, str, bool]:
-    """Problem, text and whether it is known."""
+    """Problem, text and whether it is known well."""
     try:
         fit = feed.clock.fit()
     except ToolkitError as error:
@@ -116,7 +117,8 @@ def _clock(feed: Feed) -> tuple[str | None, str, bool]:
         return None, "measuring", False
     newest = fit.fits[-1]
     text = f"{1e6 * (1 / newest.b - 1):+.0f} ppm, within {newest.sigma_ns * 1e-6:.2f} ms"
-    return None, text + (", was set just now" if fit.restarts else ""), not fit.restarts
+    good = not fit.restarts and newest.sigma_ns <= DOUBTFUL_NS
+    return None, text + (", was set just now" if fit.restarts else ""), good
 
 
 def _line(name: str, problem: str | None, text: str, good: bool) -> str:

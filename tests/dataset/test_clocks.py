@@ -205,3 +205,14 @@ def test_a_short_capture_in_bursts_on_a_busy_host_is_fitted(seed: int) -> None:
     assert abs(fit.fits[0].b - 1) < 1e-2
     lateness = host - fit.to_host(device)
     assert -1e6 < np.median(lateness) < 1e9
+
+
+@pytest.mark.parametrize("stall_s", [0.06, 0.5])
+def test_a_moment_recorded_by_a_host_that_stood_still_has_a_clock_in_doubt(stall_s: float) -> None:
+    """What a recorder that was killed at once leaves behind: 8 frames in 20 ms, the last of them late."""
+    device = 5 * 10**9 + np.arange(8) * 2_500_000
+    host = HOST_EPOCH_NS + device + np.where(np.arange(8) < 6, 0, round(stall_s * 1e9))
+    (fit,) = fit_clock(device, host).fits
+    assert fit.b == 1.0
+    assert np.abs(fit.to_host(device) - host).max() <= fit.sigma_ns
+    assert fit.sigma_ns == pytest.approx(stall_s * 1e9)

@@ -95,7 +95,7 @@ def solve_robot_world(
             f"robot-world: the board's pose is NaN or infinite in view {', '.join(map(str, bad[:8]))};"
             " drop these views"
         )
-    spread = require_observable(T_base_tcp)
+    spread = require_observable(T_base_tcp, mount)
     reading = arm_reading(T_base_tcp, mount)
     start = start_from(reading, T_cam_board, scale_known, np.random.default_rng(seed))
     pairs = PosePairs(T_base_tcp, T_cam_board, mount, camera_covariance)

@@ -148,7 +148,7 @@ def solve_streams(
     pairs = TimedPairs(
         arm.at(camera_s + offset)[known], T_cam_board[known], mount, trace=arm, camera_s=camera_s[known]
     )
-    spread = require_observable(pairs.T_base_tcp)
+    spread = require_observable(pairs.T_base_tcp, mount)
     start = start_from(
         arm_reading(pairs.T_base_tcp, mount), pairs.T_cam_board, True, np.random.default_rng(seed)
     )

@@ -51,7 +51,7 @@ def _camera(rig: Rig) -> Iterator[Check]:
             yield Check(
                 "camera",
                 True,
-                f"{info.vendor} {info.model} {info.serial}, firmware {info.firmware}, "
+                f"{info.vendor} {info.model} {info.serial}, firmware {info.firmware or 'unknown'}, "
                 f"{info.width}x{info.height} {info.pixel_format}, "
                 f"opened in {time.perf_counter() - started:.1f} s",
             )

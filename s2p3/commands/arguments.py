@@ -18,6 +18,10 @@ OptionalNumber = Annotated[float | None, tyro.conf.arg(metavar="NUMBER", help_be
 ObjectName = Annotated[str, tyro.conf.arg(metavar="NAME")]
 """Of a built-in object, or of the one in --mesh."""
 
+RequiredName = Annotated[str, tyro.conf.arg(metavar="NAME", help_behavior_hint="(required)")]
+RequiredPath = Annotated[Path, tyro.conf.arg(metavar="PATH", help_behavior_hint="(required)")]
+"""Asked for by the verb itself, because with --describe they are not needed."""
+
 Sessions = tyro.conf.Positional[
     Annotated[list[Path], tyro.conf.arg(metavar="SESSION [SESSION ...]", help_behavior_hint="(required)")]
 ]

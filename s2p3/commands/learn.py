@@ -7,8 +7,16 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from s2p3.commands.arguments import ObjectName, OptionalNumber, OptionalPath, Sessions, at_least
-from s2p3.commands.output import counting, say
+from s2p3.commands.arguments import (
+    ObjectName,
+    OptionalNumber,
+    OptionalPath,
+    RequiredName,
+    RequiredPath,
+    Sessions,
+    at_least,
+)
+from s2p3.commands.output import counting, say, show
 
 if TYPE_CHECKING:
     from s2p3.config import ExperimentConfig
@@ -134,14 +142,16 @@ def train_detector(
 
 
 def train_teacher(
-    sessions: Sessions,
+    sessions: Sessions = [],  # noqa: B006 (tyro tells a list apart, and nothing changes it)
     *,
-    object: ObjectName,
-    out: Path,
+    object: RequiredName = "",
+    out: RequiredPath = Path(),
     mesh: OptionalPath = None,
     preset: Preset = "fast",
     config: OptionalPath = None,
     threads: int = 1,
+    describe: bool = False,
+    json: bool = False,
 ) -> None:
     """Pre-train the teacher on synthetic sessions.
 
@@ -153,7 +163,13 @@ def train_teacher(
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
         config: experiment.toml instead of a preset.
         threads: CPU threads; one each when two trainings run side by side.
+        describe: train nothing; say what the teacher weighs and costs, what it takes and gives.
+        json: with --describe, as JSON.
     """
+    if describe:
+        _describe("teacher", _experiment(preset, config), json)
+        return
+    _all_given(object=object, out=out)
     from s2p3.objects import named_object
     from s2p3.training import train_teacher as train
 
@@ -172,15 +188,17 @@ def train_teacher(
 
 
 def train_student(
-    sessions: Sessions,
+    sessions: Sessions = [],  # noqa: B006 (tyro tells a list apart, and nothing changes it)
     *,
-    object: ObjectName,
-    out: Path,
+    object: RequiredName = "",
+    out: RequiredPath = Path(),
     mesh: OptionalPath = None,
     teacher: OptionalPath = None,
     preset: Preset = "fast",
     config: OptionalPath = None,
     threads: int = 1,
+    describe: bool = False,
+    json: bool = False,
 ) -> None:
     """Pre-train the student on synthetic sessions.
 
@@ -193,7 +211,13 @@ def train_student(
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
         config: experiment.toml instead of a preset.
         threads: CPU threads; one each when two trainings run side by side.
+        describe: train nothing; say what the student weighs and costs, what it takes and gives.
+        json: with --describe, as JSON.
     """
+    if describe:
+        _describe("student", _experiment(preset, config), json)
+        return
+    _all_given(object=object, out=out)
     from s2p3.objects import named_object
     from s2p3.training import train_student as train
 
@@ -249,6 +273,23 @@ def _some(sessions: list[Path]) -> list[Path]:
     if not sessions:
         raise ToolkitError("no session to train on; name one or more, made with: s2p3 synthesize")
     return sessions
+
+
+def _describe(kind: Literal["teacher", "student"], experiment: ExperimentConfig, as_json: bool) -> None:
+    from s2p3.networks.describe import describe
+
+    show(describe(kind, experiment), as_json)
+
+
+def _all_given(**values: str | Path) -> None:
+    """Raises ToolkitError: an option that a training needs is missing."""
+    from dataset.errors import ToolkitError
+
+    missing = [f"--{name}" for name, value in values.items() if value in ("", Path())]
+    if missing:
+        raise ToolkitError(
+            f"{' and '.join(missing)} missing; a training needs an object and an output folder"
+        )
 
 
 def _experiment(preset: Preset, config: Path | None) -> ExperimentConfig:

@@ -6,7 +6,7 @@ import os
 import uuid
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dataset.clocks import DeviceClock
 from dataset.errors import SessionError
+from dataset.frames import CameraInfo
 from dataset.schema import FRAME_COLUMNS, ROBOT_COLUMNS, SEGMENT_DTYPE, VERSION, declaration
 from dataset.session import Session
 from dataset.session.clock_store import store
@@ -100,7 +101,10 @@ def _check_alike(one: Session, other: Session) -> None:
     if one.kind != other.kind:
         raise refuse(f"their kinds are {one.kind} and {other.kind}")
     if replace(one.camera, packet_size=0) != replace(other.camera, packet_size=0):
-        raise refuse(f"their cameras differ ({one.camera} and {other.camera})")
+        differing = [
+            f.name for f in fields(CameraInfo) if getattr(one.camera, f.name) != getattr(other.camera, f.name)
+        ]
+        raise refuse(f"their cameras differ in {', '.join(differing)}")
     for name in (
         "calibration/K",
         "calibration/distortion",

@@ -46,9 +46,8 @@ def subset(path: str | Path, out: str | Path, indices: ArrayLike) -> int:
         count = len(session)
         keep = np.unique(np.asarray(indices, dtype=np.int64))
         if len(keep) == 0 or keep[0] < 0 or keep[-1] >= count:
-            raise SessionError(
-                f"{path}: a subset needs at least one frame, all of them within 0..{count - 1}"
-            )
+            known = f"its frames are 0 to {count - 1}" if count else "it holds none"
+            raise SessionError(f"{path}: a subset needs at least one frame of the session; {known}")
         for index in keep:
             session.raw(int(index))  # a damaged frame must not be copied as a good one
         origin = f"{len(keep)} of {count} frames of session {session.session_id}"

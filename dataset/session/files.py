@@ -70,6 +70,8 @@ def open_hdf5(path: Path) -> tuple[h5py.File, bool]:
     Raises:
         SessionError: missing, not HDF5, or damaged.
     """
+    if path.is_fifo():  # opening one waits for whoever may write to it
+        raise SessionError(f"{path} is a pipe, so no session; check the path")
     try:
         return h5py.File(path, "r"), False
     except OSError as error:
@@ -171,7 +173,7 @@ def check_format(path: Path, file: h5py.File) -> None:
     if int(major) < MAJOR:
         raise SessionError(
             f"{path} has schema {version}, this toolkit reads {MAJOR}.x; bring it up with: "
-            f"s2p3 dataset convert {path}"
+            f"s2p3 dataset convert {path} --out NEW.h5"
         )
     if int(major) > MAJOR:
         raise SessionError(

@@ -78,7 +78,7 @@ def repair(path: str | Path, on_progress: Progress = lambda done, total: None) -
     """
     path = Path(path)
     if not path.is_file():
-        raise SessionError(f"{path} does not exist; check the path")
+        raise SessionError(f"{path} does not exist, or is no file; check the path")
     if in_use(path):
         raise SessionError(f"{path} is in use by another program; repair it when that has ended")
     copy = path.with_name(path.name + ".repairing")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,9 @@ from s2p3.viewer.world import World
 
 Floats = NDArray[np.float64]
 
+UNTIMED_HZ = 10.0
+"""Frames a second at which a session is played whose times nobody measured (our choice)."""
+
 _MOST_POINTS = 2000
 _INK, _GRID, _LINE = (60, 60, 60), (225, 225, 225), (190, 110, 40)
 _LEFT, _BELOW, _ABOVE, _RIGHT = 70, 34, 30, 16
@@ -27,34 +30,51 @@ class Chart:
 
     Attributes:
         title: what it shows, with the unit.
-        time_s: (K,) since the first frame, increasing.
+        at: (K,) where along it, increasing: since the first frame, or which frame.
         values: (K,).
+        unit: of `at`: seconds, "s", or "" for frames whose times nobody measured.
     """
 
     title: str
-    time_s: Floats
+    at: Floats
     values: Floats
+    unit: str = "s"
+
+
+def seconds_of(session: Session) -> Floats | None:
+    """(N,) when each frame arrived, seconds since the first; None where nobody measured."""
+    host_ns = session.host_time_ns
+    if len(host_ns) == 0 or (host_ns == -1).all():
+        return None
+    return ((host_ns - host_ns[0]) * 1e-9).astype(np.float64)
 
 
 def charts_of(session: Session, objects: tuple[str, ...]) -> list[Chart]:
     """Frame interval, clocks, accuracy of the camera's pose, visibility: those that the session can tell."""
-    return [_thinned(chart) for chart in _charts(session, objects) if len(chart.time_s) > 1]
+    seconds = seconds_of(session)
+    clocks = [] if seconds is None else _clock_charts(session, seconds)
+    at, unit = (np.arange(len(session), dtype=np.float64), "") if seconds is None else (seconds, "s")
+    found = [*clocks, *_annotation_charts(session, objects, at, unit)]
+    return [_thinned(chart) for chart in found if len(chart.at) > 1]
 
 
-def _charts(session: Session, objects: tuple[str, ...]) -> Iterator[Chart]:
+def _clock_charts(session: Session, seconds: Floats) -> Iterator[Chart]:
     host_ns, camera_ns = session.host_time_ns, session.camera_time_ns
-    time_s = (host_ns - host_ns[0]) * 1e-9
-    yield Chart("Time between frames, ms", time_s[1:], (np.diff(camera_ns) * 1e-6).astype(np.float64))
+    if (camera_ns != -1).any():
+        yield Chart("Time between frames, ms", seconds[1:], (np.diff(camera_ns) * 1e-6).astype(np.float64))
     clocks = session.clocks
     if clocks.camera is not None:
         late_ms = ((host_ns - clocks.camera.to_host(camera_ns)) * 1e-6).astype(np.float64)
-        yield Chart("Camera: arrival after its clock's fit, ms", time_s, late_ms)
+        yield Chart("Camera: arrival after its clock's fit, ms", seconds, late_ms)
     if clocks.robot is not None and session.robot is not None:
         trace = session.robot
         fitted_ns = clocks.robot.to_host(np.rint(trace.robot_time_s * 1e9).astype(np.int64))
         late_ms = ((trace.host_time_ns - fitted_ns) * 1e-6).astype(np.float64)
         arm_s = ((trace.host_time_ns - host_ns[0]) * 1e-9).astype(np.float64)
         yield Chart("Arm: arrival after its clock's fit, ms", arm_s, late_ms)
+
+
+def _annotation_charts(session: Session, objects: tuple[str, ...], at: Floats, unit: str) -> Iterator[Chart]:
     for name, title, scale in (
         ("sigma_t", "Camera pose, sigma of position, mm", 1e3),
         ("sigma_r", "Camera pose, sigma of rotation, deg", float(np.rad2deg(1.0))),
@@ -62,9 +82,9 @@ def _charts(session: Session, objects: tuple[str, ...]) -> Iterator[Chart]:
         if session.contents.has(f"poses/{name}"):
             sigma = scale * np.asarray(session.contents.read(f"poses/{name}"), dtype=np.float64)
             if (sigma > 0).any():
-                yield Chart(title, time_s, sigma)
+                yield Chart(title, at, sigma, unit)
     for name in objects:
-        yield Chart(f"{name}: share in view", time_s, session.object_poses(name).visible_fraction)
+        yield Chart(f"{name}: share in view", at, session.object_poses(name).visible_fraction, unit)
 
 
 def drawn(chart: Chart, width: int = 900, height: int = 220) -> Picture:
@@ -76,7 +96,7 @@ def drawn(chart: Chart, width: int = 900, height: int = 220) -> Picture:
     )
     margin = 0.06 * (high - low) or max(abs(high), 1.0) * 0.1
     low, high = low - margin, high + margin
-    start, end = float(chart.time_s[0]), float(max(chart.time_s[-1], chart.time_s[0] + 1e-9))
+    start, end = float(chart.at[0]), float(max(chart.at[-1], chart.at[0] + 1e-9))
     across, up = width - _LEFT - _RIGHT, height - _ABOVE - _BELOW
 
     def at(time: Floats, value: Floats) -> NDArray[np.int32]:
@@ -91,8 +111,10 @@ def drawn(chart: Chart, width: int = 900, height: int = 220) -> Picture:
     for time in _ticks(start, end):
         column = int(at(np.array(time), np.array(low))[0])
         cv2.line(picture, (column, _ABOVE), (column, height - _BELOW), _GRID, 1)
-        _write(picture, f"{time:g} s", (min(column, width - 46) - 10, height - _BELOW + 18))
-    line = at(chart.time_s[known], chart.values[known])
+        _write(
+            picture, f"{time:g} {chart.unit}".strip(), (min(column, width - 46) - 10, height - _BELOW + 18)
+        )
+    line = at(chart.at[known], chart.values[known])
     cv2.polylines(picture, [line.reshape(-1, 1, 2)], False, _LINE, 1, cv2.LINE_AA)
     _write(picture, chart.title, (_LEFT, 19))
     return picture
@@ -133,8 +155,8 @@ def drawn_coverage(world: World, side: int = 640) -> Picture | None:
 
 
 def _thinned(chart: Chart) -> Chart:
-    step = -(-len(chart.time_s) // _MOST_POINTS)
-    return Chart(chart.title, chart.time_s[::step], chart.values[::step])
+    step = -(-len(chart.at) // _MOST_POINTS)
+    return replace(chart, at=chart.at[::step], values=chart.values[::step])
 
 
 def _ticks(low: float, high: float) -> list[float]:

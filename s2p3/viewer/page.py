@@ -16,7 +16,7 @@ from acquisition import stage
 from acquisition.web import Address, page_server
 from dataset.errors import ToolkitError
 from dataset.session import Session
-from s2p3.viewer.charts import Chart, charts_of
+from s2p3.viewer.charts import UNTIMED_HZ, Chart, charts_of, seconds_of
 from s2p3.viewer.look import DOLP, OBJECT, S0, SessionLook
 from s2p3.viewer.world import World, world_of
 
@@ -66,6 +66,9 @@ class ViewerPage:
         self._server = server
         self._look = look
         self._world = world_of(look.session, look.objects)
+        known = seconds_of(look.session)
+        self._seconds = np.arange(len(look.session)) / UNTIMED_HZ if known is None else known
+        """When each frame is played."""
         self._shown: tuple[Any, ...] = ()
         self._played_s, self._behind_s = time.monotonic(), 0.0
         server.gui.configure_theme(dark_mode=True, show_share_button=False, brand_color=(74, 144, 217))
@@ -132,13 +135,13 @@ class ViewerPage:
         grid = {"stroke": "rgba(128,128,128,.25)", "width": 1}
         axis: Any = {"stroke": "#a0a6b0", "grid": grid, "ticks": grid, "font": "11px sans-serif"}
         self._server.gui.add_uplot(
-            (chart.time_s, chart.values),
-            ({"label": "s"}, {"label": chart.title, "stroke": "#4a90d9", "width": 1}),
+            (chart.at, chart.values),
+            ({"label": chart.unit or "frame"}, {"label": chart.title, "stroke": "#4a90d9", "width": 1}),
             title=chart.title,
             scales={"x": {"time": False}},
             axes=(axis, axis),
             legend={"show": False},
-            padding=(10, 24, 0, 0),
+            padding=(14, 24, 0, 0),
             height=_CHART_HEIGHT_PX,
         )
 
@@ -199,11 +202,9 @@ class ViewerPage:
         if not self._playing.value:
             self._behind_s = 0.0
             return
-        times, index = self._look.session.host_time_ns, self._slider.value
+        times, index = self._seconds, self._slider.value
         self._behind_s += elapsed_s
-        while (
-            index + 1 < len(times) and (step_s := (times[index + 1] - times[index]) * 1e-9) <= self._behind_s
-        ):
+        while index + 1 < len(times) and (step_s := times[index + 1] - times[index]) <= self._behind_s:
             self._behind_s -= step_s
             index += 1
         if index + 1 == len(times):
@@ -214,12 +215,12 @@ class ViewerPage:
     def _describe(self, index: int) -> str:
         """A line on the frame, and one on each object in it."""
         session = self._look.session
-        seconds = (session.host_time_ns[index] - session.host_time_ns[0]) * 1e-9
-        stokes = self._look.stokes(index)
-        lines = [
-            f"<b>{seconds:.3f} s</b>, id {session.frame_ids[index]}, exposure "
-            f"{session.exposures_us[index]:.0f} us, {100 * float(stokes.valid.mean()):.1f} % of pixels usable"
-        ]
+        seconds, exposure_us = seconds_of(session), session.exposures_us[index]
+        parts = [] if seconds is None else [f"<b>{seconds[index]:.3f} s</b>"]
+        parts.append(f"id {session.frame_ids[index]}")
+        parts += [f"exposure {exposure_us:.0f} us"] if np.isfinite(exposure_us) else []
+        parts.append(f"{100 * float(self._look.stokes(index).valid.mean()):.1f} % of pixels usable")
+        lines = [", ".join(parts)]
         for name in self._look.objects:
             poses = session.object_poses(name)
             pose = poses.T_cam_obj[index]
@@ -236,13 +237,15 @@ class ViewerPage:
 
 def _summary(look: SessionLook, world: World | None) -> str:
     session = look.session
-    seconds = (session.host_time_ns[-1] - session.host_time_ns[0]) * 1e-9
+    seconds = seconds_of(session)
+    span = "" if seconds is None else f" in {seconds[-1]:.1f} s"
     camera = session.camera
     parts = [
-        f"<b>{escape(session.kind)}</b>, {len(session)} frames in {seconds:.1f} s, "
-        f"{len(session.drops)} dropped",
+        f"<b>{escape(session.kind)}</b>, {len(session)} frames{span}, {len(session.drops)} dropped",
         f"{escape(camera.vendor)} {escape(camera.model)}, {escape(camera.pixel_format)}",
     ]
+    if session.origin:
+        parts.append(escape(session.origin))
     if not session.complete:
         parts.append('<span style="color:#f59f00">incomplete: the recording was interrupted</span>')
     if not look.calibrated:

@@ -11,7 +11,7 @@ import numpy as np
 from dataset.errors import ToolkitError
 from dataset.pictures import Picture
 from dataset.session import Session
-from s2p3.viewer.charts import charts_of, drawn, drawn_coverage
+from s2p3.viewer.charts import UNTIMED_HZ, Floats, charts_of, drawn, drawn_coverage, seconds_of
 from s2p3.viewer.look import SessionLook, titled
 from s2p3.viewer.world import world_of
 
@@ -57,17 +57,17 @@ def save_pictures(path: Path, out: Path, every: int = 1, on_progress: Progress |
 
 
 def _film(look: SessionLook, path: Path, indices: range, on_progress: Progress | None) -> Path:
-    first, start_ns = look.sheet(indices[0], _FILM_TILE_PX), look.session.host_time_ns[0]
+    first, seconds = look.sheet(indices[0], _FILM_TILE_PX), seconds_of(look.session)
     size = (first.shape[1], first.shape[0])
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), _rate(look.session, indices), size)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), _rate(seconds, indices), size)
     if not writer.isOpened():
         raise ToolkitError(f"{path} cannot be written as a film; check that the folder may be written to")
     try:
         for done, index in enumerate(indices, start=1):
-            seconds = (look.session.host_time_ns[index] - start_ns) * 1e-9
             sheet = look.sheet(index, _FILM_TILE_PX)
             corner = sheet[-24:, : sheet.shape[1] // 3]
-            corner[:] = titled(corner, f"frame {index}, {seconds:.2f} s")
+            when = "" if seconds is None else f", {seconds[index]:.2f} s"
+            corner[:] = titled(corner, f"frame {index}{when}")
             writer.write(sheet)
             if on_progress is not None:
                 on_progress(done, len(indices))
@@ -76,13 +76,13 @@ def _film(look: SessionLook, path: Path, indices: range, on_progress: Progress |
     return path
 
 
-def _rate(session: Session, indices: range) -> float:
+def _rate(seconds: Floats | None, indices: range) -> float:
     """Frames per second at which the film runs as fast as the recording."""
-    shown = session.host_time_ns[indices.start : indices.stop : indices.step]
-    seconds = (shown[-1] - shown[0]) * 1e-9
-    return (
-        float(np.clip((len(shown) - 1) / seconds, _SLOWEST_HZ, _FASTEST_HZ)) if seconds > 0 else _SLOWEST_HZ
-    )
+    if seconds is None:
+        return UNTIMED_HZ
+    shown = seconds[indices.start : indices.stop : indices.step]
+    span = float(shown[-1] - shown[0])
+    return float(np.clip((len(shown) - 1) / span, _SLOWEST_HZ, _FASTEST_HZ)) if span > 0 else _SLOWEST_HZ
 
 
 def _write(path: Path, picture: Picture) -> Path:

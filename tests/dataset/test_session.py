@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import threading
 from collections.abc import Callable
@@ -342,11 +343,13 @@ def test_files_that_are_no_session_are_refused(tmp_path: Path, recorded: Path) -
         file["x"] = 1
     with h5py.File(newer, "w") as file:
         file.attrs.update({"format": "s2p3-session", "schema": "2.3"})
+    os.mkfifo(tmp_path / "e.h5")
     truncated = tmp_path / "d.h5"
     truncated.write_bytes(recorded.read_bytes()[:20_000])
     for path, message in (
         (tmp_path / "missing.h5", "does not exist"),
         (tmp_path, "is a folder"),
+        (tmp_path / "e.h5", "is a pipe"),
         (text, "not an HDF5 file"),
         (foreign, "no session: its format attribute is None"),
         (newer, "has schema 2.3, this toolkit reads up to 1.1"),

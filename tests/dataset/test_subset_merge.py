@@ -42,7 +42,7 @@ def test_a_subset_holds_the_frames_asked_for(recorded: Path, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("indices", [[], [12], [-1, 3]])
 def test_frames_that_do_not_exist_are_refused(recorded: Path, tmp_path: Path, indices: list[int]) -> None:
-    with pytest.raises(SessionError, match=r"within 0\.\.11"):
+    with pytest.raises(SessionError, match="its frames are 0 to 11"):
         subset(recorded, tmp_path / "part.h5", indices)
 
 
@@ -191,7 +191,7 @@ def test_sessions_that_differ_are_refused(
             merge([one, other], out)
         assert not out.exists()
 
-    refused(make_part("camera.h5", 9, camera=replace(camera, serial="43")), "cameras differ")
+    refused(make_part("camera.h5", 9, camera=replace(camera, serial="43")), "cameras differ in serial")
     refused(make_part("offset.h5", 9, offset=0.2), "different tool offsets")
     moved = make_part("moved.h5", 9)
     write_calibration(moved, "{}", replace(intrinsics, K=intrinsics.K * [[1.01], [1], [1]]))

@@ -18,11 +18,13 @@ from playwright.sync_api import Page, expect
 
 from acquisition.web import Address, page_server
 from dataset import SE3, CameraInfo, RawFrame, RobotTrace, SessionError
+from dataset.bop import export_bop, import_bop
 from dataset.pictures import intensity
 from dataset.session import Session, SessionWriter, write_poses
 from s2p3.cli import main
+from s2p3.silhouettes import Silhouettes
 from s2p3.viewer import save_pictures
-from s2p3.viewer.charts import charts_of, drawn
+from s2p3.viewer.charts import UNTIMED_HZ, charts_of, drawn, seconds_of
 from s2p3.viewer.look import DOLP, OBJECT, PRIORS, S0, SessionLook
 from s2p3.viewer.page import ViewerPage
 from s2p3.viewer.world import world_of
@@ -105,6 +107,24 @@ def test_charts_tell_time_and_lateness(recorded: Path) -> None:
         assert np.abs(charts["Arm: arrival after its clock's fit, ms"].values).max() < 0.05
         for chart in charts.values():
             assert (drawn(chart, 300, 100) < 200).any(axis=-1).sum() > 100
+
+
+def test_times_that_nobody_measured_are_not_made_up(cup_session: Path, tmp_path: Path) -> None:
+    """The session as it comes out of a BOP data set, which has no times."""
+    bop = export_bop([cup_session], tmp_path / "bop", Silhouettes())
+    import_bop(bop / "test" / "000000", tmp_path / "untimed.h5")
+    with Session.open(tmp_path / "untimed.h5") as session:
+        assert seconds_of(session) is None
+        (chart,) = charts_of(session, ("cup",))
+        assert (chart.title, chart.unit) == ("cup: share in view", "")
+        assert chart.at.tolist() == list(range(FRAMES))
+    save_pictures(tmp_path / "untimed.h5", tmp_path / "out")
+    film = cv2.VideoCapture(str(tmp_path / "out" / "untimed.mp4"))
+    assert film.get(cv2.CAP_PROP_FPS) == UNTIMED_HZ
+    with Session.open(cup_session) as session:
+        timed = charts_of(session, ("cup",))
+        assert {chart.unit for chart in timed} == {"s"}
+        assert timed[0].at.tolist() == pytest.approx([0.01 * index for index in range(1, FRAMES)])
 
 
 def test_save_writes_a_film_and_pictures(cup_session: Path, tmp_path: Path) -> None:

@@ -83,64 +83,84 @@ class NetworkConfig:
 
 
 @dataclass(frozen=True)
-class PretrainConfig:
-    """Supervised training on synthetic sessions."""
+class StageConfig:
+    """How any stage optimizes."""
 
     steps: int = 1150
     """Optimizer steps; with `epochs`, ignored."""
     epochs: int = 0
     """Passes through the data; 0: use `steps`."""
     batch: int = 16
+    """Images a step, shared out among the processes where there are several."""
     learning_rate: float = 1e-3
+    """The highest of the schedule."""
     schedule: Literal["cosine", "halving"] = "cosine"
     """`cosine` with 8 % warm-up (our choice), or `halving` at every quarter (the paper: every 25 of 100
     epochs)."""
     weight_decay: float = 1e-2
+    """Of AdamW; 0 is Adam (the paper)."""
     clip_norm: float = 5.0
+    """Longest gradient (our choice)."""
     ema: float = 0.98
     """Decay of the averaged weights, which are the ones kept; 0 keeps the trained weights themselves."""
+    seed: int = 0
+    """Of the first weights, the order of the data and the augmentation."""
+    checkpoint_every: int = 200
+    """Steps between two states from which an interrupted training goes on."""
+
+    def steps_over(self, samples: int) -> int:
+        """Optimizer steps: `steps`, or those of `epochs` passes through `samples` where that is given."""
+        return max(1, self.epochs * samples // self.batch) if self.epochs else self.steps
+
+
+@dataclass(frozen=True)
+class SupervisedConfig(StageConfig):
+    """A stage that knows the truth, and so can tell which of its weights are the best."""
+
+    validations: int = 10
+    """How often, at equal distances, the averaged weights are scored on frames kept from the training; the
+    best are the ones saved. 0: never, the last are saved."""
+    holdout: float = 0.1
+    """Share of the frames kept for that, where no others are named."""
+
+
+@dataclass(frozen=True)
+class PretrainConfig(SupervisedConfig):
+    """Supervised training on synthetic sessions."""
+
     dense_weight: float = 1.0
     """Weight of the teacher's dense losses (mask, coordinates, normals), our choice; 0: pose supervision
     only."""
     warm_start: bool = False
     """Student: start the encoders from the teacher's instead of ImageNet's."""
-    seed: int = 0
-    checkpoint_every: int = 200
 
 
 @dataclass(frozen=True)
-class DetectorConfig:
+class DetectorConfig(SupervisedConfig):
     """The detector: mask and box on a small polarization image (our choice throughout)."""
 
-    level: int = 4
-    """Down-sampling of the polarization image the detector sees."""
     steps: int = 300
     batch: int = 8
     learning_rate: float = 2e-3
-    weight_decay: float = 1e-2
-    clip_norm: float = 5.0
     ema: float = 0.97
+    checkpoint_every: int = 100
+    level: int = 4
+    """Down-sampling of the polarization image the detector sees."""
     threshold: float = 0.5
     """Mask probability above which a pixel belongs to the object."""
     minimum_score: float = 0.5
     """Mean mask probability below which nothing is reported."""
-    seed: int = 0
-    checkpoint_every: int = 100
 
 
 @dataclass(frozen=True)
-class SelfSupervisionConfig:
+class SelfSupervisionConfig(StageConfig):
     """Self-supervised training of the student on captured frames without poses."""
 
     steps: int = 400
-    """Optimizer steps; with `epochs`, ignored."""
-    epochs: int = 0
-    batch: int = 16
     learning_rate: float = 3e-4
-    schedule: Literal["cosine", "halving"] = "cosine"
     weight_decay: float = 0.0
     clip_norm: float = 2.0
-    ema: float = 0.98
+    checkpoint_every: int = 150
     pose_weight: float = 0.3
     mask_weight: float = 20.0
     normals_weight: float = 2.0
@@ -161,8 +181,21 @@ class SelfSupervisionConfig:
     all."""
     adapt_teacher: bool = True
     """Whether the teacher's BatchNorm statistics are re-estimated too."""
-    seed: int = 0
-    checkpoint_every: int = 150
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """Which frames a supervised training sees, and how they reach it."""
+
+    split: str | None = None
+    """Train on this split of the sessions only."""
+    validation: str | None = None
+    """What the weights to keep are chosen on: a session, or a split of the sessions, which is then not
+    trained on. By default a tenth of the frames is kept for it (`holdout`)."""
+    storage: Literal["memory", "disk"] = "memory"
+    """Whether crops are kept in memory, or made anew from the disk where they do not fit."""
+    workers: int = 0
+    """Processes that augment, a thread each; 0: the training does it itself."""
 
 
 @dataclass(frozen=True)
@@ -200,6 +233,7 @@ def paper() -> ExperimentConfig:
         schedule="halving",
         weight_decay=0.0,
         ema=0.0,
+        validations=100,
         dense_weight=0.0,
     )
     return ExperimentConfig(

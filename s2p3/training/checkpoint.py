@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import torch.distributed as dist
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -22,6 +25,21 @@ FORMAT = "s2p3-checkpoint-1"
 
 
 @dataclass(frozen=True)
+class Validation:
+    """How the weights of a checkpoint were chosen.
+
+    Attributes:
+        metric: what they scored highest by.
+        value: of it.
+        frames: on which it was measured, in words.
+    """
+
+    metric: str
+    value: float
+    frames: str
+
+
+@dataclass(frozen=True)
 class CheckpointInfo:
     """What a checkpoint holds besides weights.
 
@@ -29,9 +47,11 @@ class CheckpointInfo:
         kind: of network.
         stage: "pretrained" or "self-supervised".
         object_name, diameter_m, refractive_index: of the object it was trained for.
-        step: optimizer steps taken.
+        step: optimizer steps after which the weights were these.
         config: the whole experiment.
-        data: fingerprint of the training data.
+        data: hashes of what it was trained on, by session id.
+        commit: of the toolkit.
+        validation: None where the last weights were kept.
     """
 
     kind: Kind
@@ -41,25 +61,63 @@ class CheckpointInfo:
     refractive_index: float
     step: int
     config: ExperimentConfig
-    data: str
+    data: dict[str, str]
+    commit: str = "unknown"
+    validation: Validation | None = None
 
     @staticmethod
     def of(
-        kind: Kind, stage: str, model: ObjectModel, step: int, config: ExperimentConfig, data: str
+        kind: Kind,
+        stage: str,
+        model: ObjectModel,
+        step: int,
+        config: ExperimentConfig,
+        data: dict[str, str],
+        validation: Validation | None = None,
     ) -> CheckpointInfo:
-        """The info of a network trained for `model`."""
+        """The info of a network trained for `model` by the toolkit that is running."""
         return CheckpointInfo(
-            kind, stage, model.name, model.diameter, model.refractive_index, step, config, data
+            kind,
+            stage,
+            model.name,
+            model.diameter,
+            model.refractive_index,
+            step,
+            config,
+            data,
+            toolkit_commit(),
+            validation,
         )
 
 
+def toolkit_commit() -> str:
+    """Version and, of a checkout, the commit that is running; "-dirty" where its files differ from it."""
+    words = ["git", "describe", "--always", "--abbrev=10", "--exclude=*", "--dirty"]
+    try:
+        found = subprocess.run(
+            words, cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=10
+        )
+    except (OSError, subprocess.SubprocessError):
+        return version("s2p3")
+    return f"{version('s2p3')} {found.stdout.strip()}"
+
+
 def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
-    """Writes `path` (NAME.safetensors) and NAME.json, the weights last and atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    description = {"format": FORMAT, **asdict(info), "config": typed_toml.dumps(info.config)}
-    path.with_suffix(".json").write_text(json.dumps(description, indent=1), encoding="utf-8")
-    save_tensors(path, weights)
-    shutil.copymode(path.with_suffix(".json"), path)  # safetensors writes for the owner only
+    """Writes `path` (NAME.safetensors) and NAME.json, the weights last and atomically; the weights' own
+    metadata says the same as NAME.json.
+
+    Of several processes that train together the first one writes, and the others wait for it.
+    """
+    together = dist.is_available() and dist.is_initialized()
+    if not together or dist.get_rank() == 0:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        description = {"format": FORMAT, **asdict(info), "config": typed_toml.dumps(info.config)}
+        text = json.dumps(description, indent=1)
+        path.with_suffix(".json").write_text(text, encoding="utf-8")
+        save_tensors(path, weights, {"s2p3": text})
+        shutil.copymode(path.with_suffix(".json"), path)  # safetensors writes for the owner only
+    if together:
+        dist.barrier()
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:
@@ -89,7 +147,9 @@ def read_info(path: Path, kind: Kind | None = None, object_name: str | None = No
         raise ToolkitError(f"{description}: not a checkpoint this version reads ({FORMAT}); train again")
     try:
         config = typed_toml.loads(ExperimentConfig, values.pop("config"), source=str(description))
-        info = CheckpointInfo(config=config, **values)
+        validation = values.pop("validation", None)
+        validation = None if validation is None else Validation(**validation)
+        info = CheckpointInfo(config=config, validation=validation, **values)
     except (TypeError, KeyError) as error:
         raise ToolkitError(f"{description}: fields missing or unknown ({error}); train again") from error
     if kind is not None and info.kind != kind:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from dataset import SE3, Intrinsics
 from dataset.errors import ToolkitError
-from dataset.session import ObjectPoses, Session, mask_box
+from dataset.session import Session, mask_box
 from s2p3.config import InputConfig
 from s2p3.inputs import crop_intrinsics, extract_crop, square_box
 from s2p3.networks.detector import Detection
@@ -29,6 +30,9 @@ from s2p3.objects import ObjectModel, Symmetry
 from s2p3.rendering import rasterize
 from s2p3.training.checkpoint import save_tensors
 from s2p3.training.progress import OnStep, reporting
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 _MINIMUM_VISIBLE = 0.3  # our choice: frames that show less of the object than this are not trained on
 
@@ -52,6 +56,10 @@ class Crops:
     def __len__(self) -> int:
         return len(self.stokes)
 
+    def take(self, rows: Tensor) -> Self:
+        """Some of the crops."""
+        return type(self)(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
 
 @dataclass(frozen=True)
 class LabelledCrops(Crops):
@@ -70,13 +78,24 @@ class LabelledCrops(Crops):
     coordinates: Tensor
 
 
-def fingerprint(paths: Sequence[Path], model: ObjectModel, config: InputConfig) -> str:
-    """A short hash of which sessions (by id and length), which object and which crops."""
-    digest = hashlib.sha256(f"{model.name} {config}".encode())
+def content_hashes(paths: Sequence[Path], model: ObjectModel) -> dict[str, str]:
+    """What trainings on sessions depend on, by session id: short hashes of the images' checksums, the
+    calibration and the object's poses."""
+    hashes = {}
     for path in paths:
         with Session.open(path) as session:
-            digest.update(f"{session.session_id} {len(session)}".encode())
-    return digest.hexdigest()[:16]
+            digest = hashlib.sha256(session.contents.read("camera/crc32", slice(len(session))).tobytes())
+            camera, poses = session.working_intrinsics, session.object_poses(model.name)
+            for part in (camera.K, camera.distortion, poses.T_cam_obj.as_matrix(), poses.bbox_xywh):
+                digest.update(np.ascontiguousarray(part).tobytes())
+            hashes[session.session_id] = digest.hexdigest()[:16]
+    return hashes
+
+
+def fingerprint(paths: Sequence[Path], model: ObjectModel, config: InputConfig) -> str:
+    """A short hash of which sessions, which object and which crops."""
+    hashes = content_hashes(paths, model)
+    return hashlib.sha256(f"{model.name} {config} {hashes}".encode()).hexdigest()[:16]
 
 
 def labelled_crops(
@@ -97,24 +116,20 @@ def labelled_crops(
     stored = None if cache is None else cache / f"crops-{fingerprint(paths, model, config)}.safetensors"
     if stored is not None and stored.exists():
         return LabelledCrops(**load_file(stored))
+    shown = shown_rows(paths, model)
     rows: list[dict[str, NDArray[np.generic]]] = []
-    with reporting(f"crops of {model.name}", 1, on_step) as report:
-        for path in paths:
+    with reporting(f"crops of {model.name}", len(shown), on_step) as report:
+        for number, path in enumerate(paths):
             with Session.open(path) as session:
-                intrinsics = session.working_intrinsics
                 poses = session.object_poses(model.name)
-                shown = set(shown_frames(poses))
-                for index in range(len(session)):
-                    mask = poses.mask(index)
-                    if index in shown and mask.any():
-                        stokes = np.moveaxis(session.stokes(index).stack(), 0, -1)
-                        pose = poses.T_cam_obj[index]
-                        rows.append(labelled_crop(stokes, mask, pose, intrinsics, model, config, len(rows)))
-                    report(index + 1, len(session), {})
-    if not rows:
-        raise ToolkitError(
-            f"{', '.join(map(str, paths))}: no frame shows {model.name!r}; annotate or synthesize first"
-        )
+                for index in (index for which, index in shown if which == number):
+                    stokes = np.moveaxis(session.stokes(index).stack(), 0, -1)
+                    mask, pose = poses.mask(index), poses.T_cam_obj[index]
+                    crop = labelled_crop(
+                        stokes, mask, pose, session.working_intrinsics, model, config, len(rows)
+                    )
+                    rows.append(crop)
+                    report(len(rows), len(shown), {})
     crops = collate(rows)
     if stored is not None:
         stored.parent.mkdir(parents=True, exist_ok=True)
@@ -122,9 +137,23 @@ def labelled_crops(
     return crops
 
 
-def shown_frames(poses: ObjectPoses) -> list[int]:
-    """Indices of the frames that show enough of an object to be trained on."""
-    return [int(index) for index in np.flatnonzero(poses.visible_fraction >= _MINIMUM_VISIBLE)]
+def shown_rows(paths: Sequence[Path], model: ObjectModel) -> list[tuple[int, int]]:
+    """Session and frame, as positions in `paths` and in it, of every frame that shows enough of the object to
+    be trained on.
+
+    Raises ToolkitError: a session lacks the object, or no frame shows it.
+    """
+    rows = []
+    for number, path in enumerate(paths):
+        with Session.open(path) as session:
+            poses = session.object_poses(model.name)
+            seen = (poses.visible_fraction >= _MINIMUM_VISIBLE) & (poses.bbox_xywh[:, 2:].min(axis=1) > 0)
+            rows += [(number, int(index)) for index in np.flatnonzero(seen)]
+    if not rows:
+        raise ToolkitError(
+            f"{', '.join(map(str, paths))}: no frame shows {model.name!r}; annotate or synthesize first"
+        )
+    return rows
 
 
 def labelled_crop(

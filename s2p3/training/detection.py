@@ -10,19 +10,20 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
 from dataset.session import Session
-from s2p3.config import DetectorConfig, ExperimentConfig
+from s2p3.config import ExperimentConfig
 from s2p3.inputs import rotate_stokes
 from s2p3.networks.detector import CELL, Detector, detector_input, downsample
 from s2p3.networks.lite0 import channels_last
 from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
-from s2p3.training.checkpoint import CheckpointInfo
-from s2p3.training.crops import fingerprint
-from s2p3.training.loop import LoopConfig, Losses, optimize, sample_indices
+from s2p3.training.checkpoint import CheckpointInfo, Validation
+from s2p3.training.crops import content_hashes
+from s2p3.training.examples import MOST_HELD_OUT
+from s2p3.training.loop import Forward, Losses, Score, optimize
 from s2p3.training.progress import OnStep, reporting
 
 # Ranges of the augmentation, our choice: wide, because the captured domain is not known.
@@ -52,6 +53,10 @@ class SmallFrames:
     def __len__(self) -> int:
         return len(self.stokes)
 
+    def take(self, rows: Tensor) -> SmallFrames:
+        """Some of the images."""
+        return SmallFrames(self.stokes[rows], self.masks[rows])
+
 
 def small_frames(
     paths: Sequence[Path], object_name: str, level: int, on_step: OnStep | None = None
@@ -79,34 +84,87 @@ def train_detector(
     config: ExperimentConfig,
     out: Path,
     on_step: OnStep | None = None,
+    workers: int = 0,
 ) -> Path:
     """Trains a detector of `model` and writes `out`/detector.safetensors, which is returned.
 
     Args:
         sessions: with poses and masks of the object, usually synthetic.
-        on_step: see `loop.optimize`.
+        on_step, workers: see `loop.optimize`.
 
     Raises ToolkitError: a session lacks the object; see also `loop.optimize`.
     """
     settings = config.detector
     path = out / "detector.safetensors"
-    data = fingerprint(sessions, model, config.input)
+    hashes = content_hashes(sessions, model)
     frames = small_frames(sessions, model.name, settings.level)
+    order = torch.randperm(len(frames), generator=torch.Generator().manual_seed(settings.seed))
+    count = min(int(settings.holdout * len(frames)), MOST_HELD_OUT) if settings.validations else 0
+    data, score = FrameData(frames, order[count:].sort().values), None
+    if count:
+        score = Score("mask_iou", MaskScorer(frames.take(order[:count])), settings.validations)
     torch.manual_seed(settings.seed)
     network = channels_last(Detector(frames.masks.shape[1], config.network.imagenet))
-
-    def loss_at(generator: torch.Generator) -> Losses:
-        stokes, masks = augment_frames(
-            frames, sample_indices(len(frames), settings.batch, generator), generator
-        )
-        logits, distances = network(detector_input(stokes))
-        return detector_losses(logits, distances, masks)
-
-    run = f"{data} {settings}"
-    trained = optimize(network, loss_at, _loop(settings), path, run, "detector", on_step)
-    info = CheckpointInfo.of("detector", "pretrained", model, settings.steps, config, data)
-    checkpoint.save(path, trained.state_dict(), info)
+    trained = optimize(
+        network,
+        data,
+        detector_objective,
+        settings,
+        path,
+        f"{hashes} {model.name}",
+        "detector",
+        score=score,
+        workers=workers,
+        on_step=on_step,
+    )
+    validation = None
+    if score is not None and trained.score is not None:
+        validation = Validation(score.name, trained.score, f"{count} of {len(frames)} frames")
+    info = CheckpointInfo.of("detector", "pretrained", model, trained.step, config, hashes, validation)
+    checkpoint.save(path, trained.network.state_dict(), info)
     return path
+
+
+@dataclass(frozen=True)
+class FrameData:
+    """Augmented batches of whole images, see `loader.Data`: what the detector sees of them, and the masks."""
+
+    frames: SmallFrames
+    rows: Tensor
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __call__(self, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        stokes, masks = augment_frames(self.frames, self.rows[rows], generator)
+        return detector_input(stokes), masks
+
+
+def detector_objective(forward: Forward, batch: tuple[Tensor, Tensor]) -> Losses:
+    """The losses of one batch of `FrameData`."""
+    images, masks = batch
+    logits, distances = forward(images)
+    return detector_losses(logits, distances, masks)
+
+
+@dataclass(frozen=True)
+class MaskScorer:
+    """Mean intersection over union of predicted and true masks, percent, without augmentation."""
+
+    frames: SmallFrames
+
+    @torch.no_grad()
+    def __call__(self, network: nn.Module) -> float:
+        device, shares = next(network.parameters()).device, []
+        for stokes, masks in zip(
+            self.frames.stokes.split(8), self.frames.masks.float().split(8), strict=True
+        ):
+            logits, _ = network(detector_input(stokes.float()).to(device))
+            fine = F.interpolate(logits.cpu(), scale_factor=float(CELL), mode="bilinear")
+            found, true = fine[..., : masks.shape[2], : masks.shape[3]] > 0, masks > 0.5
+            both, either = (found & true).sum((1, 2, 3)), (found | true).sum((1, 2, 3))
+            shares.append(both / either.clamp_min(1))
+        return 100 * float(torch.cat(shares).mean())
 
 
 def load_detector(path: Path, object_name: str | None = None) -> tuple[Detector, CheckpointInfo]:
@@ -189,16 +247,3 @@ def augment_frames(frames: SmallFrames, indices: Tensor, generator: torch.Genera
     stokes = stokes * uniform(1 - _GAIN, 1 + _GAIN, 1, 1, 1)
     noise = torch.randn(stokes.shape, generator=generator) * s0.clamp_min(0).sqrt()
     return stokes + uniform(0, _NOISE, 1, 1, 1) * noise, masks
-
-
-def _loop(settings: DetectorConfig) -> LoopConfig:
-    return LoopConfig(
-        settings.steps,
-        settings.learning_rate,
-        "cosine",
-        settings.weight_decay,
-        settings.clip_norm,
-        settings.ema,
-        settings.seed,
-        settings.checkpoint_every,
-    )

@@ -1,69 +1,66 @@
-"""Labelled crops made anew for every epoch, by worker processes, for data that does not fit into memory.
+"""How batches reach a training: by number, from worker processes, out of memory or off the disk.
 
-Every worker has its own file handles and reads the Stokes images from the decoded cache beside each session,
-so that a crop costs a few disk pages, a resampling and a rasterization. The order of an epoch depends on the
-seed and the epoch alone; several ranks share it out among themselves.
+A batch follows from the seed and its number alone, so that it does not matter who makes it, nor where a
+training that was interrupted goes on. `CropDataset` makes labelled crops anew whenever they are asked for,
+where the memory does not hold them: each process has its own file handles and reads the Stokes images from
+the decoded cache beside each session, so that a crop costs a few disk pages, a resampling and a
+rasterization.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+import signal
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
 
 from dataset.errors import ToolkitError
 from dataset.session import Session
 from dataset.stokes_cache import cached_stokes
 from s2p3.config import InputConfig
 from s2p3.objects import ObjectModel
-from s2p3.training.crops import LabelledCrops, collate, labelled_crop, shown_frames
+from s2p3.training.crops import LabelledCrops, collate, labelled_crop, shown_rows
 
 Row = dict[str, NDArray[np.generic]]
 
 
-class CropDataset(Dataset[Row]):
-    """Random access to the rows that `labelled_crops` keeps in memory, in the same order.
+class Data(Protocol):
+    """What a training draws its batches from. Is sent to worker processes."""
 
-    A frame of which a mask says that nothing is seen is left out, as there. Works in any process it is sent
-    to.
+    def __len__(self) -> int:
+        """How many rows an epoch has."""
+
+    def __call__(self, rows: Tensor, generator: torch.Generator) -> Any:
+        """The batch of some rows: a tree of tensors, see `trees`. Whatever is random about it comes from
+        `generator`."""
+
+
+class CropDataset(Dataset[Row]):
+    """Random access to the rows that `labelled_crops` keeps in memory, in the same order; in any
+    process it is sent to.
 
     Args:
         paths: sessions with poses of the object.
         model: the object.
         config: what the crops are like.
-        split: name of the sessions' split to draw from; all frames when None.
 
     Raises:
-        ToolkitError: a session lacks the object or the split, or no frame shows it.
+        ToolkitError: a session lacks the object, or no frame shows it.
     """
 
-    def __init__(
-        self, paths: Sequence[Path], model: ObjectModel, config: InputConfig, split: str | None = None
-    ) -> None:
+    def __init__(self, paths: Sequence[Path], model: ObjectModel, config: InputConfig) -> None:
         self.paths, self.model, self.config = list(paths), model, config
-        self.rows: list[tuple[int, int]] = []
-        for number, path in enumerate(self.paths):
+        self.rows = shown_rows(paths, model)
+        for path in self.paths:
             cached_stokes(path)  # made here, once, and not by every worker
-            with Session.open(path) as session:
-                poses = session.object_poses(model.name)
-                if split is not None and split not in session.splits:
-                    known = ", ".join(session.splits) or "none"
-                    raise ToolkitError(f"{path} has no split {split!r}; its splits: {known}")
-                allowed = None if split is None else set(session.splits[split].tolist())
-                for index in shown_frames(poses):
-                    seen = poses.bbox_xywh[index][2:].min() > 0
-                    if seen and (allowed is None or index in allowed):
-                        self.rows.append((number, index))
-        if not self.rows:
-            raise ToolkitError(
-                f"{', '.join(map(str, paths))}: no frame shows {model.name!r}; annotate or synthesize first"
-            )
         self._forget()
 
     def __len__(self) -> int:
@@ -83,6 +80,10 @@ class CropDataset(Dataset[Row]):
             row,
         )
 
+    def take(self, rows: Tensor) -> LabelledCrops:
+        """Some rows as one batch."""
+        return collate([self[int(row)] for row in rows])
+
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_open": {}, "_process": 0}
 
@@ -99,66 +100,114 @@ class CropDataset(Dataset[Row]):
         return self._open[number]
 
 
-class EpochSampler(Sampler[int]):
-    """The rows of one epoch in an order that follows from seed and epoch, shared out among ranks.
+@dataclass(frozen=True)
+class Share:
+    """What one of several training processes has to make of every batch: every `world`-th row from `rank`
+    on."""
 
-    All ranks draw equally many: where the count does not divide, rows from the order's beginning come twice.
+    rank: int = 0
+    world: int = 1
 
-    Args:
-        count: rows of the data set.
-        seed: of the order.
-        rank, world: which of how many processes this is.
-    """
-
-    def __init__(self, count: int, seed: int = 0, rank: int = 0, world: int = 1) -> None:
-        if not 0 <= rank < world:
+    def __post_init__(self) -> None:
+        if not 0 <= self.rank < self.world:
             raise ToolkitError(
-                f"rank {rank} of {world} processes does not exist; ranks go from 0 to {world - 1}"
+                f"rank {self.rank} of {self.world} processes does not exist; ranks go from 0 to "
+                f"{self.world - 1}"
             )
-        self.count, self.seed, self.rank, self.world = count, seed, rank, world
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Chooses the epoch whose order comes next."""
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        return -(-self.count // self.world)
-
-    def __iter__(self) -> Iterator[int]:
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
-        order = torch.randperm(self.count, generator=generator)
-        whole = order.repeat(-(-self.world // max(self.count, 1)) + 1)[: len(self) * self.world]
-        return iter(whole[self.rank :: self.world].tolist())
 
 
-def crop_loader(
-    data: CropDataset, batch: int, *, workers: int = 1, seed: int = 0, rank: int = 0, world: int = 1
-) -> DataLoader[LabelledCrops]:
-    """Batches of labelled crops; call `loader.sampler.set_epoch(n)` before each epoch.
+def rows_at(step: int, batch: int, count: int, seed: int) -> Tensor:
+    """(batch,) the rows, out of `count`, of a batch: the next ones in an endless sequence of epochs, each of
+    which goes through all rows once, in an order that follows from seed and epoch."""
+    start = step * batch
+    epochs = range(start // count, (start + batch - 1) // count + 1)
+    orders = [
+        torch.randperm(count, generator=torch.Generator().manual_seed(seed * 998_244_353 + epoch))
+        for epoch in epochs
+    ]
+    return torch.cat(orders)[start - epochs[0] * count :][:batch]
+
+
+WHOLE = Share()
+
+
+class Steps(Dataset[Any]):
+    """The batches of a training by their number: the same in whichever process, and in whichever order, they
+    are made.
 
     Args:
-        data: the crops.
-        batch: rows a batch; the last one of an epoch is dropped where it is smaller.
-        workers: processes; 0 reads in this one.
-        seed: of the order.
-        rank, world: which of how many training processes this is.
+        data: makes a batch of given rows, see `Data`.
+        batch: rows of all processes together. Raises ToolkitError: it cannot be shared out evenly.
+        seed: of the order and of the generators that `data` is given.
+        share: of every batch that is made here.
     """
-    return DataLoader(
-        data,  # type: ignore[arg-type]
-        batch_size=batch,
-        sampler=EpochSampler(len(data), seed, rank, world),
+
+    def __init__(self, data: Data, batch: int, seed: int, share: Share = WHOLE) -> None:
+        if batch % share.world:
+            raise ToolkitError(
+                f"a batch of {batch} cannot be shared out among {share.world} processes; choose a multiple"
+            )
+        self.data, self.batch, self.seed, self.share = data, batch, seed, share
+
+    def __getitem__(self, step: int) -> Any:
+        rank, world = self.share.rank, self.share.world
+        rows = rows_at(step, self.batch, len(self.data), self.seed)[rank::world]
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + step) * world + rank)
+        return self.data(rows, generator)
+
+
+def stream(steps: Steps, first: int, last: int, workers: int = 0) -> Generator[Any, None, None]:
+    """The batches from `first` to before `last`, made ahead by worker processes with one thread each.
+
+    Workers share the tensors of `steps.data` and hand batches back through shared memory: nothing is copied.
+
+    Args:
+        workers: processes; 0 makes the batches here, when they are asked for.
+
+    Raises ToolkitError: whatever kept a worker from making a batch.
+    """
+    loader = DataLoader(
+        _Telling(steps),
+        batch_size=None,
+        sampler=range(first, last),
         num_workers=workers,
-        collate_fn=collate,
-        drop_last=True,
-        worker_init_fn=_single_thread,
+        collate_fn=_as_it_is,
+        worker_init_fn=_alone,
         multiprocessing_context="spawn" if workers else None,
-        persistent_workers=workers > 0,
+        generator=torch.Generator(),  # or the loader would draw from, and so change, the global one
     )
+    for made in loader:
+        if isinstance(made, _Failed):
+            raise ToolkitError(made.why)
+        yield made
 
 
-def _single_thread(_: int) -> None:
+@dataclass(frozen=True)
+class _Failed:
+    """Sent instead of a batch: an exception would arrive wrapped into its worker's traceback."""
+
+    why: str
+
+
+class _Telling(Dataset[Any]):
+    def __init__(self, steps: Steps) -> None:
+        self.steps = steps
+
+    def __getitem__(self, step: int) -> Any:
+        try:
+            return self.steps[step]
+        except ToolkitError as error:
+            return _Failed(str(error))
+
+
+def _as_it_is(batch: Any) -> Any:
+    return batch
+
+
+def _alone(_: int) -> None:
+    """A worker has one thread, and leaves Ctrl-C to the process that started it."""
     import cv2
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

@@ -1,119 +1,169 @@
-"""One plain training loop: seeded by step, averaged weights, JSON lines, checkpoints, exact resume.
+"""One plain training loop: seeded by step, averaged weights, the best of them kept, exact resume.
 
-Randomness comes from one generator per step, seeded by (seed, step), so a run that was stopped and resumed
-sees the same batches, augmentations and noise as one that was not, and its losses are the same numbers.
+Batch n follows from the seed and n alone (see `loader`), so a run that was stopped and resumed sees the same
+batches, augmentations and noise as one that was not, and its losses are the same numbers. Several processes
+(`accelerate launch`, `torchrun`) share every batch out among themselves and average their gradients.
 """
 
 from __future__ import annotations
 
 import copy
 import hashlib
-import json
 import math
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import torch
-from safetensors import safe_open
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
+from s2p3.config import StageConfig
 from s2p3.training.checkpoint import save_tensors
+from s2p3.training.loader import Data, Steps, stream
+from s2p3.training.log import RunLog
+from s2p3.training.processes import Processes
 from s2p3.training.progress import OnStep, reporting
+from s2p3.training.resume import State
+from s2p3.training.trees import named_tensors, to_device
 
 Losses = dict[str, Tensor]
-LossAt = Callable[[torch.Generator], Losses]
+Forward = Callable[..., Any]
 Network = TypeVar("Network", bound=nn.Module)
 
 _WARM_UP = 0.08
 _LOG_EVERY = 10
-_MAX_SKIPPED = 20
+
+
+class Objective(Protocol):
+    """What a stage minimizes. A dataclass where it holds tensors: they are brought to the network's
+    device."""
+
+    def __call__(self, forward: Forward, batch: Any) -> Losses:
+        """The losses of one batch: "total" is minimized, the rest logged.
+
+        Args:
+            forward: the network; its outputs are float32, whatever it computes in.
+            batch: what the stage's `Data` made.
+        """
 
 
 @dataclass(frozen=True)
-class LoopConfig:
-    """How to optimize; the fields mean what they mean in `s2p3.config`."""
+class Score:
+    """How good a network is, on what it was not trained on.
 
-    steps: int
-    learning_rate: float
-    schedule: Literal["cosine", "halving"]
-    weight_decay: float
-    clip_norm: float
-    ema: float
-    seed: int
-    checkpoint_every: int
+    Attributes:
+        name: of the number, which is the higher the better.
+        of: the number of a network in evaluation mode.
+        times: how often it is taken, at equal distances, the last time at the end.
+    """
+
+    name: str
+    of: Callable[[Any], float]
+    times: int
+
+    def is_due(self, done: int, steps: int) -> bool:
+        """Whether it is taken after `done` of `steps` steps."""
+        return self.times * done // steps > self.times * (done - 1) // steps
+
+
+@dataclass(frozen=True)
+class Trained(Generic[Network]):
+    """What a training has come to.
+
+    Attributes:
+        network: with the weights to keep, on the CPU, in evaluation mode.
+        step: after which it had them.
+        score: theirs; None where nothing was scored.
+    """
+
+    network: Network
+    step: int
+    score: float | None = None
 
 
 def optimize(
     network: Network,
-    loss_at: LossAt,
-    config: LoopConfig,
+    data: Data,
+    objective: Objective,
+    settings: StageConfig,
     path: Path,
     fingerprint: str,
     label: str,
+    *,
+    score: Score | None = None,
+    workers: int = 0,
     on_step: OnStep | None = None,
-) -> Network:
-    """Trains `network` in place and returns the averaged network, in evaluation mode.
+) -> Trained[Network]:
+    """Trains `network` in place; returns its averaged weights: the best or, where none are scored, the last.
 
     Args:
-        loss_at: forms the losses of one batch from a seeded generator; their entry "total" is minimized, the
-            rest logged.
-        path: of the checkpoint to be; the log NAME.log.jsonl and the resume file NAME.resume.safetensors
-            stand beside it.
-        fingerprint: of everything the run depends on besides `config`; a resume file of another run is
+        data: what the batches are drawn from.
+        path: of the checkpoint to be. The log NAME.log.jsonl, the resume file NAME.resume.safetensors and the
+            folder tensorboard/NAME stand beside it.
+        fingerprint: of everything the run depends on besides `settings`; a resume file of another run is
             refused.
         label: what the progress bar and messages call this run.
+        workers: processes that make the batches; with 0 this one does.
         on_step: called after every step with step, steps and the latest losses; without it a progress bar is
             shown.
 
-    Raises ToolkitError: the resume file belongs to other settings; the loss is not finite again and again.
+    Raises ToolkitError: the resume file belongs to other settings; a loss or gradient is not finite.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    run = hashlib.sha256(f"{config}{fingerprint}".encode()).hexdigest()[:16]
-    resume = path.with_suffix(".resume.safetensors")
-    log_path = path.with_suffix(".log.jsonl")
+    steps = settings.steps_over(len(data))
+    run = hashlib.sha256(f"{settings} {steps} {fingerprint}".encode()).hexdigest()[:16]
+    processes = Processes.start()
+    objective = to_device(objective, processes.device)
+    network.to(processes.device)
     average = copy.deepcopy(network).eval()
     optimizer = torch.optim.AdamW(
-        network.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
+        network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
     )
-    first = _restore(resume, run, network, average, optimizer) if resume.exists() else 0
-    _truncate(log_path, first)
-    skipped = 0
+    state = State(path.with_suffix(".resume.safetensors"), run, network, average, optimizer)
+    first = processes.agreed(state.restore())
+    forward = processes.prepare(network)
+    batches = stream(Steps(data, settings.batch, settings.seed, processes.share), first, steps, workers)
     started = time.perf_counter()
-    with reporting(label, config.steps, on_step) as report:
-        for step in range(first, config.steps):
+    with RunLog(path, first) as log, reporting(label, steps, on_step) as report, closing(batches):
+        for done, batch in enumerate(batches, start=first + 1):
+            rate = settings.learning_rate * rate_factor(settings.schedule, (done - 1) / steps)
             for group in optimizer.param_groups:
-                group["lr"] = config.learning_rate * rate_factor(config.schedule, step / config.steps)
+                group["lr"] = rate
             network.train()
-            generator = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
-            losses = loss_at(generator)
+            batch = to_device(batch, processes.device)
+            losses = objective(forward, batch)
             optimizer.zero_grad(set_to_none=True)
             losses["total"].backward()
-            norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip_norm)
-            skipped = 0 if torch.isfinite(norm) else skipped + 1
-            if skipped > _MAX_SKIPPED:
-                raise ToolkitError(
-                    f"{label}: the gradient was not finite {skipped} times in a row at step {step}; "
-                    "lower the learning rate, or check the data with `s2p3 dataset validate`"
-                )
-            if skipped == 0:
-                optimizer.step()
-                update_average(average, network, min(config.ema, (step + 1) / (step + 10)))
-            done = step + 1
+            norm = float(nn.utils.clip_grad_norm_(network.parameters(), settings.clip_norm))
             values = {name: float(loss.detach()) for name, loss in losses.items()}
-            report(done, config.steps, values)
-            if done % _LOG_EVERY == 0 or done == config.steps:
+            if not math.isfinite(values["total"] + norm):
+                kept = path.with_suffix(f".bad-batch{processes.suffix}.safetensors")
+                raise _not_finite(label, done, values, norm, kept, network, batch)
+            optimizer.step()
+            update_average(average, network, min(settings.ema, done / (done + 9)))
+            if not processes.first:
+                continue
+            scored = score is not None and score.is_due(done, steps)
+            if score is not None and scored:
+                values[score.name] = score.of(average)
+                state.consider(done, values[score.name])
+            report(done, steps, values)
+            if scored or done % _LOG_EVERY == 0 or done == steps:
                 seconds = round(time.perf_counter() - started, 2)
-                rate = optimizer.param_groups[0]["lr"]
-                _log(log_path, {"step": done, "seconds": seconds, "learning_rate": rate, **values})
-            if done % config.checkpoint_every == 0 and done < config.steps:
-                _store(resume, run, done, network, average, optimizer)
-    resume.unlink(missing_ok=True)
-    return average.eval()
+                log.write({"step": done, "seconds": seconds, "learning_rate": rate, **values})
+            if done % settings.checkpoint_every == 0 and done < steps:
+                state.store(done)
+    state.forget()
+    best = state.best
+    if best is not None:
+        average.load_state_dict(best.weights)
+    processes.spread(average)
+    average = average.cpu().eval()
+    return Trained(average, steps) if best is None else Trained(average, best.step, best.score)
 
 
 def rate_factor(schedule: Literal["cosine", "halving"], progress: float) -> float:
@@ -136,60 +186,26 @@ def update_average(average: nn.Module, network: nn.Module, decay: float) -> None
             mean.copy_(value)
 
 
-def steps_of(steps: int, epochs: int, batch: int, samples: int) -> int:
-    """Optimizer steps: `steps`, or those of `epochs` passes where that is given."""
-    return epochs * max(1, samples // batch) if epochs else steps
-
-
 def sample_indices(samples: int, batch: int, generator: torch.Generator) -> Tensor:
     """(batch,) indices drawn with replacement."""
     return torch.randint(0, samples, (batch,), generator=generator)
 
 
-def _store(
-    path: Path, run: str, step: int, network: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer
-) -> None:
-    tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
-    tensors |= {f"average.{name}": value for name, value in average.state_dict().items()}
-    for index, state in optimizer.state_dict()["state"].items():
-        tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
-    save_tensors(path, tensors, {"run": run, "step": str(step)})
-
-
-def _restore(
-    path: Path, run: str, network: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer
-) -> int:
-    with safe_open(path, "pt") as file:
-        metadata = file.metadata()
-    if metadata.get("run") != run:
-        raise ToolkitError(
-            f"{path}: was left by a run with other settings or data; "
-            "delete it, or choose another output folder"
-        )
-    parts: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimizer": {}}
-    for name, value in load_file(path).items():
-        part, rest = name.split(".", 1)
-        parts[part][rest] = value
-    network.load_state_dict(parts["network"])
-    average.load_state_dict(parts["average"])
-    states: dict[int, dict[str, Tensor]] = {}
-    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
-    for name, value in parts["optimizer"].items():
-        index, field = name.split(".")
-        if value.dim() > 0:  # the fused kernel walks weight and moments side by side: same memory layout
-            value = torch.empty_like(weights[int(index)]).copy_(value)
-        states.setdefault(int(index), {})[field] = value
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": states})
-    return int(metadata["step"])
-
-
-def _truncate(path: Path, step: int) -> None:
-    """Drops the log lines after `step`: those of a run that was stopped after its last checkpoint."""
-    lines = path.read_text(encoding="utf-8").splitlines() if step and path.exists() else []
-    kept = [line for line in lines if json.loads(line)["step"] <= step]
-    path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-
-
-def _log(path: Path, values: dict[str, float]) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(values) + "\n")
+def _not_finite(
+    label: str,
+    step: int,
+    values: dict[str, float],
+    norm: float,
+    path: Path,
+    network: nn.Module,
+    batch: Any,
+) -> ToolkitError:
+    """Keeps what a step that cannot be taken was made of: the batch, and the weights that it met."""
+    tensors = named_tensors(batch, "batch") | named_tensors(network.state_dict(), "network")
+    save_tensors(path, tensors, {"step": str(step)})
+    wrong = [name for name, value in values.items() if not math.isfinite(value) and name != "total"]
+    what = f"the loss ({', '.join(wrong) or 'total'})" if wrong or math.isfinite(norm) else "the gradient"
+    return ToolkitError(
+        f"{label}: {what} is not finite at step {step}; the batch and the weights are in {path}; lower the "
+        "learning rate, or check the data with: s2p3 dataset validate"
+    )

@@ -7,6 +7,7 @@ teacher's dense losses (`dense_weight`) and the warm start are our choice; `s2p3
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -14,20 +15,23 @@ from torch import Tensor
 
 from dataset.errors import ToolkitError
 from s2p3 import inputs, losses
-from s2p3.config import ExperimentConfig, PretrainConfig
+from s2p3.config import ExperimentConfig, FrameSource, PretrainConfig
 from s2p3.inputs import View
 from s2p3.networks.build import build_student, build_teacher
 from s2p3.networks.pose_head import decode_pose, ray_rotation, site_from_translation
 from s2p3.networks.student import Student
-from s2p3.networks.teacher import Teacher, pose_of
+from s2p3.networks.teacher import Teacher, TeacherOutput, pose_of
 from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
 from s2p3.training.batches import Targets, form_input, form_targets
-from s2p3.training.checkpoint import CheckpointInfo
-from s2p3.training.crops import LabelledCrops, fingerprint, labelled_crops
-from s2p3.training.loop import LoopConfig, Losses, optimize, sample_indices, steps_of
+from s2p3.training.checkpoint import CheckpointInfo, Kind, Validation
+from s2p3.training.crops import content_hashes
+from s2p3.training.examples import CropSource, Examples
+from s2p3.training.loop import Forward, Losses, Objective, Score, optimize
 from s2p3.training.progress import OnStep
+from s2p3.training.scoring import PoseScorer
 
+ALL_FRAMES = FrameSource()
 MODEL_POINTS = 300
 _SYMMETRY_STEPS = 36
 
@@ -39,6 +43,7 @@ def train_teacher(
     out: Path,
     cache: Path | None = None,
     on_step: OnStep | None = None,
+    frames: FrameSource = ALL_FRAMES,
 ) -> Path:
     """Pre-trains the teacher and writes `out`/teacher.safetensors, which is returned.
 
@@ -46,33 +51,17 @@ def train_teacher(
         sessions: with poses of the object, usually synthetic.
         cache: folder for the crops, shared between trainings.
         on_step: see `loop.optimize`.
+        frames: which of the sessions to train on, and how they reach the training.
 
     Raises ToolkitError: a session lacks the object; see also `loop.optimize`.
     """
     settings = config.teacher
-    crops = labelled_crops(sessions, model, config.input, cache)
+    examples = Examples.of(sessions, model, config.input, settings, frames, cache)
     torch.manual_seed(settings.seed)
     network = build_teacher(config, imagenet=True)
-    points, symmetries = model_tensors(model)
-
-    def loss_at(generator: torch.Generator) -> Losses:
-        batch, targets = _draw(crops, model, config, settings.batch, generator)
-        output = network(batch.polarization, batch.priors)
-        terms = pose_terms(output.pose, batch.K, targets, batch.size, model.diameter, points, symmetries)
-        if settings.dense_weight > 0:
-            maps = (output.mask_logits, output.normals, output.coordinates)
-            dense = losses.dense_loss(*maps, targets.mask, targets.normals, targets.coordinates).mean()
-            terms["dense"] = dense
-            terms["total"] = terms["total"] + settings.dense_weight * dense
-        return terms
-
-    path = out / "teacher.safetensors"
-    data = fingerprint(sessions, model, config.input)
-    steps = steps_of(settings.steps, settings.epochs, settings.batch, len(crops))
-    trained = optimize(network, loss_at, _loop(settings, steps), path, f"{data} {config}", "teacher", on_step)
-    info = CheckpointInfo.of("teacher", "pretrained", model, steps, config, data)
-    checkpoint.save(path, trained.state_dict(), info)
-    return path
+    objective = TeacherObjective(*model_tensors(model), model.diameter, settings.dense_weight)
+    run = Pretraining("teacher", model, config, settings, examples, content_hashes(sessions, model))
+    return run.train(network, objective, out, frames.workers, on_step)
 
 
 def train_student(
@@ -83,18 +72,19 @@ def train_student(
     cache: Path | None = None,
     teacher: Path | None = None,
     on_step: OnStep | None = None,
+    frames: FrameSource = ALL_FRAMES,
 ) -> Path:
-    """Pre-trains the student and writes `out`/student.safetensors, which is returned; arguments as
-    `train_teacher`.
+    """Pre-trains the student and writes `out`/student.safetensors, which is returned.
 
     Args:
-        teacher: checkpoint whose encoders the student starts from; needed where `config.student.warm_start`
-            is set.
+        teacher: checkpoint whose encoders to start from, where `config.student.warm_start` says so.
 
-    Raises ToolkitError: the warm start lacks its teacher; see also `train_teacher`.
+    Others as `train_teacher`.
+
+    Raises ToolkitError: a warm start without a teacher, or of another object's; see also `train_teacher`.
     """
     settings = config.student
-    crops = labelled_crops(sessions, model, config.input, cache)
+    examples = Examples.of(sessions, model, config.input, settings, frames, cache)
     torch.manual_seed(settings.seed)
     network = build_student(config, imagenet=True)
     if settings.warm_start:
@@ -103,20 +93,58 @@ def train_student(
                 "student.warm_start needs the teacher's checkpoint; give it, or set warm_start = false"
             )
         network.encoder.load_state_dict(load_teacher(teacher, model.name)[0].encoder.state_dict())
-    points, symmetries = model_tensors(model)
+    objective = PoseObjective(*model_tensors(model), model.diameter)
+    run = Pretraining("student", model, config, settings, examples, content_hashes(sessions, model))
+    return run.train(network, objective, out, frames.workers, on_step)
 
-    def loss_at(generator: torch.Generator) -> Losses:
-        batch, targets = _draw(crops, model, config, settings.batch, generator)
-        output = network(batch.polarization, batch.priors)
-        return pose_terms(pose_of(output), batch.K, targets, batch.size, model.diameter, points, symmetries)
 
-    path = out / "student.safetensors"
-    data = fingerprint(sessions, model, config.input)
-    steps = steps_of(settings.steps, settings.epochs, settings.batch, len(crops))
-    trained = optimize(network, loss_at, _loop(settings, steps), path, f"{data} {config}", "student", on_step)
-    info = CheckpointInfo.of("student", "pretrained", model, steps, config, data)
-    checkpoint.save(path, trained.state_dict(), info)
-    return path
+@dataclass(frozen=True)
+class Pretraining:
+    """One supervised run: what it is of, and what it learns from."""
+
+    kind: Kind
+    model: ObjectModel
+    config: ExperimentConfig
+    settings: PretrainConfig
+    examples: Examples
+    hashes: dict[str, str]
+
+    def train(
+        self,
+        network: Student | Teacher,
+        objective: Objective,
+        out: Path,
+        workers: int,
+        on_step: OnStep | None,
+    ) -> Path:
+        """Optimizes `network` and writes `out`/KIND.safetensors, which is returned."""
+        path, examples, index = out / f"{self.kind}.safetensors", self.examples, self.model.refractive_index
+        data = LabelledData(examples.source, examples.rows, index, self.config)
+        score = None
+        if examples.held_out is not None:
+            scorer = PoseScorer(examples.held_out, self.model, self.config)
+            score = Score(scorer.name, scorer, self.settings.validations)
+        fingerprint = f"{self.hashes} {self.config} {self.model.name} {examples.origin}"
+        trained = optimize(
+            network,
+            data,
+            objective,
+            self.settings,
+            path,
+            fingerprint,
+            self.kind,
+            score=score,
+            workers=workers,
+            on_step=on_step,
+        )
+        validation = None
+        if score is not None and trained.score is not None:
+            validation = Validation(score.name, trained.score, examples.origin)
+        info = CheckpointInfo.of(
+            self.kind, "pretrained", self.model, trained.step, self.config, self.hashes, validation
+        )
+        checkpoint.save(path, trained.network.state_dict(), info)
+        return path
 
 
 def load_teacher(path: Path, object_name: str | None = None) -> tuple[Teacher, CheckpointInfo]:
@@ -135,6 +163,84 @@ def model_tensors(model: ObjectModel) -> tuple[Tensor, Tensor]:
     """Surface points (MODEL_POINTS, 3) and symmetries (M, 4, 4) of an object, as the losses take them."""
     points = torch.from_numpy(model.surface_points(MODEL_POINTS)).float()
     return points, torch.from_numpy(model.symmetry.sampled(_SYMMETRY_STEPS)).float()
+
+
+@dataclass(frozen=True)
+class LabelledBatch:
+    """What the networks see of B crops, and its truth."""
+
+    seen: inputs.NetworkInput
+    targets: Targets
+
+
+@dataclass(frozen=True)
+class LabelledData:
+    """Augmented batches of labelled crops, see `loader.Data`.
+
+    Attributes:
+        source: of the crops.
+        rows: of the source, to draw from.
+        refractive_index: of the object.
+        config: of the experiment.
+    """
+
+    source: CropSource
+    rows: Tensor
+    refractive_index: float
+    config: ExperimentConfig
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __call__(self, rows: Tensor, generator: torch.Generator) -> LabelledBatch:
+        crops, every = self.source.take(self.rows[rows]), torch.arange(len(rows))
+        view = View.random(len(rows), self.config.augmentation, generator)
+        seen = form_input(
+            crops, every, view, self.refractive_index, self.config, generator, degrade_mask=True
+        )
+        return LabelledBatch(seen, form_targets(crops, every, view, self.config))
+
+
+@dataclass(frozen=True)
+class PoseObjective:
+    """Supervision by poses alone: the paper's.
+
+    Attributes:
+        points: (P, 3) of the object, metres.
+        symmetries: (M, 4, 4) motions that leave it unchanged.
+        diameter_m: of the object.
+    """
+
+    points: Tensor
+    symmetries: Tensor
+    diameter_m: float
+
+    def __call__(self, forward: Forward, batch: LabelledBatch) -> Losses:
+        return self.of(pose_of(forward(batch.seen.polarization, batch.seen.priors)), batch)
+
+    def of(self, output: Tensor, batch: LabelledBatch) -> Losses:
+        """The losses of a head's output."""
+        seen = batch.seen
+        return pose_terms(
+            output, seen.K, batch.targets, seen.size, self.diameter_m, self.points, self.symmetries
+        )
+
+
+@dataclass(frozen=True)
+class TeacherObjective(PoseObjective):
+    """The same, and with a `dense_weight` above zero the teacher's maps, too (our choice)."""
+
+    dense_weight: float
+
+    def __call__(self, forward: Forward, batch: LabelledBatch) -> Losses:
+        output: TeacherOutput = forward(batch.seen.polarization, batch.seen.priors)
+        terms = self.of(output.pose, batch)
+        if self.dense_weight > 0:
+            maps, truth = (output.mask_logits, output.normals, output.coordinates), batch.targets
+            dense = losses.dense_loss(*maps, truth.mask, truth.normals, truth.coordinates).mean()
+            terms["dense"] = dense
+            terms["total"] = terms["total"] + self.dense_weight * dense
+        return terms
 
 
 def pose_terms(
@@ -156,25 +262,3 @@ def pose_terms(
     depth = targets.translation[:, 2]
     translation = losses.translation_loss(site, true_site, depth, diameter_m).mean()
     return {"total": rotation + translation, "rotation": rotation, "translation": translation}
-
-
-def _draw(
-    crops: LabelledCrops, model: ObjectModel, config: ExperimentConfig, batch: int, generator: torch.Generator
-) -> tuple[inputs.NetworkInput, Targets]:
-    indices = sample_indices(len(crops), batch, generator)
-    view = View.random(batch, config.augmentation, generator)
-    seen = form_input(crops, indices, view, model.refractive_index, config, generator, degrade_mask=True)
-    return seen, form_targets(crops, indices, view, config)
-
-
-def _loop(settings: PretrainConfig, steps: int) -> LoopConfig:
-    return LoopConfig(
-        steps,
-        settings.learning_rate,
-        settings.schedule,
-        settings.weight_decay,
-        settings.clip_norm,
-        settings.ema,
-        settings.seed,
-        settings.checkpoint_every,
-    )

@@ -20,8 +20,7 @@ from s2p3 import losses, physics
 from s2p3.config import ExperimentConfig, SelfSupervisionConfig
 from s2p3.inputs import NetworkInput, View
 from s2p3.networks.pose_head import decode_pose
-from s2p3.networks.student import Student
-from s2p3.networks.teacher import MAP_STRIDE
+from s2p3.networks.teacher import MAP_STRIDE, pose_of
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
@@ -29,7 +28,7 @@ from s2p3.training.adaptation import adapt_batch_norm, set_momentum
 from s2p3.training.batches import form_input
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops
-from s2p3.training.loop import LoopConfig, Losses, optimize, sample_indices, steps_of
+from s2p3.training.loop import Forward, Losses, optimize
 from s2p3.training.pretrain import load_student, load_teacher, model_tensors
 from s2p3.training.progress import OnStep
 from s2p3.training.pseudo_labels import PseudoLabels, carry_labels, make_labels, pooled_maps
@@ -45,6 +44,7 @@ def self_supervise(
     out: Path,
     settings: SelfSupervisionConfig | None = None,
     on_step: OnStep | None = None,
+    workers: int = 0,
 ) -> Path:
     """Adapts the pre-trained student to captured frames and writes `out`/adapted.safetensors, which is
     returned.
@@ -53,7 +53,7 @@ def self_supervise(
         crops: of captured frames, see `crops.captured_crops`.
         teacher, student: checkpoints of the pre-trained networks.
         settings: weights and schedule; by default those the student's experiment holds.
-        on_step: see `loop.optimize`.
+        on_step, workers: see `loop.optimize`.
 
     Raises ToolkitError: checkpoints of another object or of different inputs; see also `loop.optimize`.
     """
@@ -71,56 +71,81 @@ def self_supervise(
             adapt_batch_norm(guide, crops, model.refractive_index, config, settings)
     labels = make_labels(guide, crops, model, config, settings)
     set_momentum(network, _BATCH_NORM_MOMENTUM)
-    objective = _Objective(network, crops, labels, model, config, settings)
-    steps = steps_of(settings.steps, settings.epochs, settings.batch, len(crops))
-    path = out / "adapted.safetensors"
-    data = hashlib.sha256(crops.stokes.numpy().tobytes()).hexdigest()[:16]
-    run = f"{data} {guide_info} {info} {settings}"
-    trained = optimize(network, objective, _loop(settings, steps), path, run, "self-supervision", on_step)
-    checkpoint.save(
-        path,
-        trained.state_dict(),
-        CheckpointInfo.of("student", "self-supervised", model, steps, config, data),
+    data = _CapturedData(crops, labels, RenderMesh.from_mesh(model.mesh), model.refractive_index, config)
+    points, symmetries = model_tensors(model)
+    objective = _Objective(
+        data.mesh, points, symmetries, labels.threshold, model.diameter, model.refractive_index, settings
     )
+    path = out / "adapted.safetensors"
+    hashes = {"crops": hashlib.sha256(crops.stokes.numpy().tobytes()).hexdigest()[:16]}
+    run = f"{hashes} {guide_info} {info}"
+    trained = optimize(
+        network, data, objective, settings, path, run, "self-supervision", workers=workers, on_step=on_step
+    )
+    info = CheckpointInfo.of("student", "self-supervised", model, trained.step, config, hashes)
+    checkpoint.save(path, trained.network.state_dict(), info)
     return path
 
 
-@dataclass
+@dataclass(frozen=True)
+class _Batch:
+    """What the student sees of B crops, what the teacher says about them, and its pose rendered."""
+
+    seen: NetworkInput
+    target: PseudoLabels
+    teacher_mask: Tensor
+    teacher_normals: Tensor
+
+
+@dataclass(frozen=True)
+class _CapturedData:
+    """Augmented batches of captured crops, see `loader.Data`."""
+
+    crops: Crops
+    labels: PseudoLabels
+    mesh: RenderMesh
+    refractive_index: float
+    config: ExperimentConfig
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    @torch.no_grad()
+    def __call__(self, rows: Tensor, generator: torch.Generator) -> _Batch:
+        view = View.random(len(rows), self.config.augmentation, generator)
+        seen = form_input(self.crops, rows, view, self.refractive_index, self.config, generator)
+        target = carry_labels(self.labels, self.crops, rows, view, self.config)
+        pose, size = (target.rotation, target.translation), seen.size
+        maps = pooled_maps(render(self.mesh, *pose, seen.K, size, size, silhouette=False))
+        return _Batch(seen, target, *maps)
+
+
+@dataclass(frozen=True)
 class _Objective:
     """The losses of one batch, Eq. (11): L_pseudo + L_physics with their weights."""
 
-    network: Student
-    crops: Crops
-    labels: PseudoLabels
-    model: ObjectModel
-    config: ExperimentConfig
+    mesh: RenderMesh
+    points: Tensor
+    symmetries: Tensor
+    threshold: float
+    diameter_m: float
+    refractive_index: float
     settings: SelfSupervisionConfig
 
-    def __post_init__(self) -> None:
-        self.mesh = RenderMesh.from_mesh(self.model.mesh)
-        self.points, self.symmetries = model_tensors(self.model)
-
-    def __call__(self, generator: torch.Generator) -> Losses:
-        indices = sample_indices(len(self.crops), self.settings.batch, generator)
-        view = View.random(self.settings.batch, self.config.augmentation, generator)
-        seen = form_input(self.crops, indices, view, self.model.refractive_index, self.config, generator)
-        output = self.network(seen.polarization, seen.priors)
-        rotation, translation, _ = decode_pose(output, seen.K, seen.size, self.model.diameter)
+    def __call__(self, forward: Forward, batch: _Batch) -> Losses:
+        seen, target = batch.seen, batch.target
+        output = pose_of(forward(seen.polarization, seen.priors))
+        rotation, translation, _ = decode_pose(output, seen.K, seen.size, self.diameter_m)
         rendered = render(self.mesh, rotation, translation, seen.K, seen.size, seen.size)
         mask, normals = pooled_maps(rendered)
-        target = carry_labels(self.labels, self.crops, indices, view, self.config)
-        with torch.no_grad():
-            pose = (target.rotation, target.translation)
-            teacher_mask, teacher_normals = pooled_maps(
-                render(self.mesh, *pose, seen.K, seen.size, seen.size, silhouette=False)
-            )
-        threshold = self.labels.threshold
-        target_mask = losses.pseudo_maps(target.delta, threshold, teacher_mask, target.mask)
-        target_normals = losses.pseudo_maps(target.delta, threshold, teacher_normals, target.normals)
+        pose = (target.rotation, target.translation)
+        rule = (target.delta, self.threshold)
+        target_mask = losses.pseudo_maps(*rule, batch.teacher_mask, target.mask)
+        target_normals = losses.pseudo_maps(*rule, batch.teacher_normals, target.normals)
         distance = losses.pose_loss(self.points, rotation, translation, *pose, self.symmetries)
         settings = self.settings
         terms = {
-            "pose": (losses.pose_weight(target.delta) * distance).mean() / self.model.diameter,
+            "pose": (losses.pose_weight(target.delta) * distance).mean() / self.diameter_m,
             "mask": losses.mask_loss(mask, target_mask).mean(),
             "normals": losses.normals_loss(normals, target_normals, mask, target_mask).mean(),
         }
@@ -149,18 +174,5 @@ class _Objective:
             rendered.normals_interior,
             rays,
             inside.float(),
-            self.model.refractive_index,
+            self.refractive_index,
         )
-
-
-def _loop(settings: SelfSupervisionConfig, steps: int) -> LoopConfig:
-    return LoopConfig(
-        steps,
-        settings.learning_rate,
-        settings.schedule,
-        settings.weight_decay,
-        settings.clip_norm,
-        settings.ema,
-        settings.seed,
-        settings.checkpoint_every,
-    )

@@ -33,7 +33,7 @@ def networks(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> tupl
     student, detector = build_student(config), Detector(imagenet=False)
     kinds: tuple[Kind, ...] = ("student", "detector")
     for path, kind, network in zip(paths, kinds, (student, detector), strict=True):
-        checkpoint.save(path, network.state_dict(), CheckpointInfo.of(kind, "pretrained", cup, 0, config, ""))
+        checkpoint.save(path, network.state_dict(), CheckpointInfo.of(kind, "pretrained", cup, 0, config, {}))
     return paths
 
 

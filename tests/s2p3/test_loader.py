@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import pickle
 import runpy
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from dataset.errors import ToolkitError
-from dataset.session import write_split
 from s2p3.config import fast
 from s2p3.objects import build
 from s2p3.training.crops import LabelledCrops, collate, labelled_crops
-from s2p3.training.loader import CropDataset, EpochSampler, crop_loader
+from s2p3.training.loader import CropDataset, Share, Steps, stream
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +45,29 @@ def test_rows_are_those_of_training_in_memory(session: Path) -> None:
     same(collate([data[row] for row in range(len(data))]), expected, 2e-3)
 
 
-def test_a_worker_hands_out_an_epoch(session: Path) -> None:
-    model = build("cup")
-    data = CropDataset([session], model, CONFIG)
-    here = list(crop_loader(data, 2, workers=0, seed=3))
-    spawned = list(crop_loader(data, 2, workers=1, seed=3))
-    assert len(here) == len(spawned) == 3
-    for one, other in zip(here, spawned, strict=True):
+@dataclass(frozen=True)
+class Plain:
+    """The crops themselves, with a number that only their generator decides."""
+
+    crops: CropDataset | LabelledCrops
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    def __call__(self, rows: Tensor, generator: torch.Generator) -> tuple[LabelledCrops, Tensor]:
+        return self.crops.take(rows), torch.rand(1, generator=generator)
+
+
+def test_workers_make_the_same_batches_from_any_step_on(session: Path) -> None:
+    data = CropDataset([session], build("cup"), CONFIG)
+    here = list(stream(Steps(Plain(data), 2, seed=3), 0, 5))
+    spawned = list(stream(Steps(Plain(data), 2, seed=3), 2, 5, workers=2))
+    for (one, number), (other, its_number) in zip(here[2:], spawned, strict=True):
         same(one, other, 0)
-    assert sorted(int(row) for batch in here for row in batch.frames) == list(range(6))
+        assert number == its_number
+    assert len({float(number) for _, number in here}) == 5
+    first_epoch = [int(row) for batch, _ in here[:3] for row in batch.frames]
+    assert sorted(first_epoch) == list(range(6))
 
 
 def test_a_data_set_travels_without_its_handles(session: Path) -> None:
@@ -64,31 +78,51 @@ def test_a_data_set_travels_without_its_handles(session: Path) -> None:
     np.testing.assert_array_equal(copy[2]["stokes"], before["stokes"])
 
 
-def test_a_split_limits_the_rows(session: Path) -> None:
-    write_split(session, "train", [1, 4])
-    assert len(CropDataset([session], build("cup"), CONFIG, "train")) == 2
-    with pytest.raises(ToolkitError, match="no split 'x'; its splits: train"):
-        CropDataset([session], build("cup"), CONFIG, "x")
+@pytest.mark.parametrize(("count", "batch", "world"), [(12, 4, 1), (12, 6, 3), (13, 4, 4), (3, 8, 2)])
+def test_processes_share_epochs_that_a_seed_orders(count: int, batch: int, world: int) -> None:
+    def rows(seed: int, step: int) -> list[int]:
+        steps = [Steps(Rows(count), batch, seed, Share(rank, world)) for rank in range(world)]
+        shares = [part[step] for part in steps]
+        assert {len(share) for share in shares} == {batch // world}
+        return [row for share in shares for row in share]
 
-
-@pytest.mark.parametrize(("count", "world"), [(12, 1), (12, 3), (13, 4), (3, 5)])
-def test_ranks_share_an_epoch(count: int, world: int) -> None:
-    def order(seed: int, epoch: int) -> list[list[int]]:
-        samplers = [EpochSampler(count, seed, rank, world) for rank in range(world)]
-        for sampler in samplers:
-            sampler.set_epoch(epoch)
-        return [list(sampler) for sampler in samplers]
-
-    shares = order(0, 0)
-    assert {len(share) for share in shares} == {-(-count // world)}
-    assert {row for share in shares for row in share} == set(range(count))
-    assert order(0, 0) == shares
+    whole = [row for step in range(count) for row in rows(0, step)]
+    assert sorted(whole) == sorted(list(range(count)) * batch)
+    together = [row for step in range(count) for row in Steps(Rows(count), batch, 0)[step]]
+    for epoch in range(batch):
+        assert sorted(together[epoch * count : (epoch + 1) * count]) == list(range(count))
+    assert rows(0, 0) == rows(0, 0)
     if count > 3:
-        assert order(0, 1) != shares
-        assert order(1, 0) != shares
+        assert rows(0, 0) != rows(1, 0)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The numbers of the rows, without anything in them."""
+
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __call__(self, rows: Tensor, generator: torch.Generator) -> list[int]:
+        del generator
+        return rows.tolist()
+
+
+def test_what_keeps_a_worker_from_its_batch_is_said_in_one_line(session: Path) -> None:
+    broken = CropDataset([session], build("cup"), CONFIG)
+    broken.paths[0] = session.with_name("gone.h5")
+    with pytest.raises(ToolkitError, match=r"^[^\n]*gone.h5[^\n]*$"):
+        next(stream(Steps(Plain(broken), 2, seed=3), 0, 5, workers=1))
 
 
 @pytest.mark.parametrize("rank", [-1, 2])
 def test_a_rank_that_does_not_exist_is_refused(rank: int) -> None:
     with pytest.raises(ToolkitError, match="does not exist"):
-        EpochSampler(4, 0, rank, 2)
+        Share(rank, 2)
+
+
+def test_a_batch_that_cannot_be_shared_out_is_refused() -> None:
+    with pytest.raises(ToolkitError, match="3 cannot be shared out among 2"):
+        Steps(Rows(9), 3, 0, Share(0, 2))

@@ -18,7 +18,7 @@ from dataset import SE3
 from dataset.errors import ToolkitError
 from dataset.session import Session, mask_box
 from s2p3 import config as presets
-from s2p3.config import AugmentationConfig, ExperimentConfig
+from s2p3.config import AugmentationConfig, ExperimentConfig, StageConfig
 from s2p3.inputs import View
 from s2p3.networks.detector import Detection
 from s2p3.networks.teacher import Teacher
@@ -44,7 +44,9 @@ from s2p3.training.pseudo_labels import carry_labels, make_labels
 
 def tiny() -> ExperimentConfig:
     base = presets.quick()
-    pretrain = dataclasses.replace(base.teacher, steps=24, batch=4, checkpoint_every=10, learning_rate=2e-3)
+    pretrain = dataclasses.replace(
+        base.teacher, steps=24, batch=4, checkpoint_every=10, learning_rate=2e-3, validations=2, holdout=0.25
+    )
     still = AugmentationConfig(1.4, 1.4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     return dataclasses.replace(
         base,
@@ -132,7 +134,7 @@ def test_a_symmetry_axis_leaves_one_pose(cup: ObjectModel) -> None:
 def test_teacher_and_student_learn(trained: Path) -> None:
     for name in ("teacher", "student"):
         log = log_of(trained / f"{name}.log.jsonl")
-        assert [line["step"] for line in log] == [10, 20, 24]
+        assert [line["step"] for line in log] == [10, 12, 20, 24]
         assert log[-1]["total"] < 0.75 * log[0]["total"]
 
 
@@ -140,7 +142,7 @@ def test_checkpoints_say_what_they_are(trained: Path, cup: ObjectModel) -> None:
     network, info = load_teacher(trained / "teacher.safetensors", "cup")
     assert isinstance(network, Teacher)
     assert not network.training
-    assert (info.kind, info.stage, info.object_name, info.step) == ("teacher", "pretrained", "cup", 24)
+    assert (info.kind, info.stage, info.object_name) == ("teacher", "pretrained", "cup")
     assert info.config == tiny()
     assert info.diameter_m == cup.diameter
     with pytest.raises(ToolkitError, match=r"'cup', not 'fork'"):
@@ -195,21 +197,6 @@ def test_a_resume_file_of_other_settings_is_refused(
         train_student([cup_session], cup, other, tmp_path, on_step=silent)
 
 
-def test_a_loss_that_is_never_finite_stops_the_training(tmp_path: Path) -> None:
-    settings = loop.LoopConfig(100, 1e-3, "cosine", 0.0, 1.0, 0.9, 0, 50)
-    layer = torch.nn.Linear(2, 1)
-    with pytest.raises(ToolkitError, match="not finite"):
-        loop.optimize(
-            layer,
-            lambda _: {"total": layer(torch.ones(1, 2)).sum() * float("nan")},
-            settings,
-            tmp_path / "x.safetensors",
-            "",
-            "test",
-            silent,
-        )
-
-
 def test_learning_rates() -> None:
     assert loop.rate_factor("halving", 0.0) == 1
     assert loop.rate_factor("halving", 0.26) == 0.5
@@ -217,14 +204,16 @@ def test_learning_rates() -> None:
     assert loop.rate_factor("cosine", 0.08) == 1
     assert loop.rate_factor("cosine", 0.0) < 0.05
     assert loop.rate_factor("cosine", 0.999) < 0.01
-    assert loop.steps_of(7, 0, 8, 100) == 7
-    assert loop.steps_of(7, 3, 8, 100) == 36
+    assert StageConfig(steps=7, epochs=0, batch=8).steps_over(100) == 7
+    assert StageConfig(steps=7, epochs=3, batch=8).steps_over(100) == 37
 
 
 def test_a_warm_start_takes_the_teachers_encoders(
     trained: Path, cup_session: Path, cup: ObjectModel, tmp_path: Path
 ) -> None:
-    student = dataclasses.replace(tiny().student, warm_start=True, steps=1, learning_rate=0.0, ema=0.0)
+    student = dataclasses.replace(
+        tiny().student, warm_start=True, steps=1, learning_rate=0.0, ema=0.0, validations=0
+    )
     experiment = dataclasses.replace(tiny(), student=student)
     with pytest.raises(ToolkitError, match="warm_start"):
         train_student([cup_session], cup, experiment, tmp_path, on_step=silent)

@@ -33,6 +33,6 @@ def save_untrained(folder: Path, model: ObjectModel, config: ExperimentConfig) -
     paths = {}
     for kind, network in networks.items():
         paths[kind] = folder / f"{kind}.safetensors"
-        info = CheckpointInfo.of(kind, "pretrained", model, 0, config, "")  # type: ignore[arg-type]
+        info = CheckpointInfo.of(kind, "pretrained", model, 0, config, {})  # type: ignore[arg-type]
         checkpoint.save(paths[kind], network.state_dict(), info)
     return paths

@@ -13,7 +13,8 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +25,13 @@ from dataset.polarimetry import Stokes, encode
 from dataset.session import ObjectPoses, Session, SessionWriter, mask_box, write_object, write_poses
 from s2p3.config import fast
 from s2p3.inputs import View
+from s2p3.networks.build import build_student
 from s2p3.objects import build
 from s2p3.rendering import rasterize
 from s2p3.training.batches import form_input, form_targets
-from s2p3.training.loader import CropDataset, crop_loader
-from s2p3.training.pretrain import build_student, model_tensors, pose_terms
+from s2p3.training.crops import LabelledCrops
+from s2p3.training.loader import CropDataset, Steps, stream
+from s2p3.training.pretrain import model_tensors, pose_terms
 
 HEIGHT, WIDTH, BATCH = 512, 612, 16
 OBJECT = "cup"
@@ -56,6 +59,20 @@ def main() -> None:
             print(f"{name:22}{value:10.2f}")
 
 
+@dataclass(frozen=True)
+class Plain:
+    """Batches of crops as they come off the disk."""
+
+    crops: CropDataset
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    def __call__(self, rows: torch.Tensor, generator: torch.Generator) -> LabelledCrops:
+        del generator
+        return self.crops.take(rows)
+
+
 def measure(path: Path, size: int, seconds: float) -> dict[str, float]:
     """The rates, in images and megabytes of pixels a second."""
     model, config = build(OBJECT), fast()
@@ -64,19 +81,11 @@ def measure(path: Path, size: int, seconds: float) -> dict[str, float]:
         input=replace(config.input, size=size, canonical_size=size * 3 // 2),
         network=replace(config.network, total_stride=32 if size == 256 else 16),  # 32 as published
     )
-    data = CropDataset([path], model, config.input)
-    loader = crop_loader(data, BATCH)
-    batches = iter(loader)
-    crops = next(batches)  # the worker has started and read its first batches
-    done, epoch, start = 0, 0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
-        for batch in batches:
-            done += len(batch)
-        epoch += 1
-        loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
-        batches = iter(loader)
-    images = done / (time.perf_counter() - start)
-    del batches, loader
+    with closing(
+        stream(Steps(Plain(CropDataset([path], model, config.input)), BATCH, 0), 0, 10**6, 1)
+    ) as batches:
+        crops = next(batches)  # the worker has started and read its first batches
+        images = rate(lambda: len(next(batches)), seconds)
 
     indices, view = torch.arange(len(crops)), View.centred(len(crops), config.input.zoom)
     batch = form_input(crops, indices, view, model.refractive_index, config)

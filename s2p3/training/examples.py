@@ -1,0 +1,125 @@
+"""What a supervised training learns from, and what it is scored on: frames of sessions, kept apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from dataset.errors import ToolkitError
+from dataset.session import Session
+from s2p3.config import FrameSource, InputConfig, SupervisedConfig
+from s2p3.objects import ObjectModel
+from s2p3.training.crops import LabelledCrops, labelled_crops, shown_rows
+from s2p3.training.loader import CropDataset
+
+MOST_HELD_OUT = 256
+"""Frames kept for scoring by default: more would cost time and tell no more."""
+
+
+class CropSource(Protocol):
+    """Labelled crops by row: in memory (`LabelledCrops`) or off the disk (`CropDataset`)."""
+
+    def take(self, rows: Tensor) -> LabelledCrops:
+        """Some rows as one batch."""
+
+
+@dataclass(frozen=True)
+class Examples:
+    """Crops to learn from, and others to be scored on.
+
+    Attributes:
+        source: of the crops to learn from.
+        rows: of these, those to learn from.
+        held_out: the others; None where there are none.
+        origin: of the others, in words.
+    """
+
+    source: CropSource
+    rows: Tensor
+    held_out: LabelledCrops | None
+    origin: str
+
+    @staticmethod
+    def of(
+        sessions: Sequence[Path],
+        model: ObjectModel,
+        config: InputConfig,
+        settings: SupervisedConfig,
+        frames: FrameSource,
+        cache: Path | None = None,
+    ) -> Examples:
+        """The crops of sessions, as `frames` says.
+
+        Args:
+            cache: see `labelled_crops`.
+
+        Raises ToolkitError: a session lacks the object or the split, or no frame shows it.
+        """
+        source: CropSource
+        if frames.storage == "memory":
+            source = labelled_crops(sessions, model, config, cache)
+        else:
+            source = CropDataset(sessions, model, config)
+        division = divide(sessions, model, settings, frames)
+        if division.session is not None:
+            other = labelled_crops([division.session], model, config, cache)
+            return Examples(source, division.rows, other, division.origin)
+        held_out = source.take(division.held_out) if len(division.held_out) else None
+        return Examples(source, division.rows, held_out, division.origin)
+
+
+@dataclass(frozen=True)
+class Division:
+    """Rows of `shown_rows`: to learn from, and to be scored on; or the session to be scored on."""
+
+    rows: Tensor
+    held_out: Tensor
+    session: Path | None
+    origin: str
+
+
+def divide(
+    sessions: Sequence[Path], model: ObjectModel, settings: SupervisedConfig, frames: FrameSource
+) -> Division:
+    """Which frames are for learning and which for scoring.
+
+    Raises ToolkitError: as `Examples.of`.
+    """
+    shown = shown_rows(sessions, model)
+    rows = torch.arange(len(shown)) if frames.split is None else _of_split(sessions, shown, frames.split)
+    nothing = torch.arange(0)
+    validation = frames.validation
+    if not settings.validations:
+        return Division(rows, nothing, None, "")
+    if validation is None:
+        count = min(int(settings.holdout * len(rows)), MOST_HELD_OUT)
+        order = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(settings.seed))]
+        origin = f"{count} of {len(rows)} frames, drawn with seed {settings.seed}"
+        return Division(order[count:].sort().values, order[:count].sort().values, None, origin)
+    if Path(validation).is_file():
+        return Division(rows, nothing, Path(validation), f"the session {validation}")
+    held_out = _of_split(sessions, shown, validation)
+    return Division(rows[~torch.isin(rows, held_out)], held_out, None, f"the split {validation!r}")
+
+
+def _of_split(sessions: Sequence[Path], shown: Sequence[tuple[int, int]], split: str) -> Tensor:
+    """Rows of the frames in a split."""
+    allowed: set[tuple[int, int]] = set()
+    for number, path in enumerate(sessions):
+        with Session.open(path) as session:
+            if split not in session.splits:
+                known = ", ".join(session.splits) or "none"
+                raise ToolkitError(
+                    f"{path}: no split {split!r} (its splits: {known}), and no session of that name; "
+                    f"make one with: s2p3 dataset split {path}"
+                )
+            allowed |= {(number, int(index)) for index in session.splits[split]}
+    rows = [row for row, place in enumerate(shown) if place in allowed]
+    if not rows:
+        raise ToolkitError(f"the split {split!r} holds no frame that shows the object; choose another")
+    return torch.tensor(rows)

@@ -47,17 +47,22 @@ def browser_page() -> Iterator[Page]:
 
 @pytest.fixture(scope="session")
 def shown_images() -> Callable[[Page], list[NDArray[np.uint8]]]:
-    """The images that a page was sent, in their own resolution: (h, w, 3) BGR."""
+    """The images that a page was sent, once it has loaded them, in their own resolution: (h, w, 3) BGR."""
 
     def images(page: Page) -> list[NDArray[np.uint8]]:
-        urls = page.evaluate(
-            """() => [...document.images].filter(image => image.src.startsWith("blob:")).map(image => {
-                const canvas = document.createElement("canvas");
-                [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
-                canvas.getContext("2d").drawImage(image, 0, 0);
-                return canvas.toDataURL("image/png");
-            })"""
-        )
+        urls = page.wait_for_function(
+            """() => {
+                const images = [...document.images].filter(image => image.src.startsWith("blob:"));
+                const loaded = images.length && images.every(image => image.complete && image.naturalWidth);
+                if (!loaded) return null;
+                return images.map(image => {
+                    const canvas = document.createElement("canvas");
+                    [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+                    canvas.getContext("2d").drawImage(image, 0, 0);
+                    return canvas.toDataURL("image/png");
+                });
+            }"""
+        ).json_value()
         coded = [np.frombuffer(base64.b64decode(url.split(",")[1]), np.uint8) for url in urls]
         return [np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR), np.uint8) for png in coded]
 

@@ -1,7 +1,7 @@
 """The compiled inner loops of `dataset.polarimetry`: one pass over the mosaic, no intermediate image.
 
 Compiled when first called and cached on disk; they release the GIL. The 2x2 polarizer cell `90 45 / 135 0`
-is written out; tests hold the loops against the plain `split_angles` and `Stokes.from_angles`.
+is written out; tests hold the loops against the plain `split_angles` and a matrix of least squares.
 """
 
 from __future__ import annotations
@@ -47,35 +47,60 @@ def mono_stokes(
 
 @_compiled
 def colour_stokes(
-    raw: NDArray[Any],
+    words: NDArray[Any],
     scale: np.float32,
     saturated: float,
     dark: np.float32,
     out: NDArray[np.float32],
     valid: NDArray[np.bool_],
 ) -> None:
-    """(4h, 4w) mosaic to (3, h, w) Stokes and (h, w) validity; each angle the mean of its Bayer pixels."""
+    """(4h, w) words to (3, h, w) Stokes and (h, w) validity; each angle the mean of its Bayer pixels.
+
+    A word is the four pixels of a super-pixel's row, the first in the lowest bits. Pixels of one polarizer
+    lie in every other quarter of it: two are added, or held against the limit, in one step.
+    """
+    word = words.dtype.type
+    bits, twice = word(2 * words.itemsize), word(4 * words.itemsize)  # of one pixel, of two
+    carry = word(word(1) << bits)
+    quarters = word(word(carry - word(1)) * word(word(1) | word(word(1) << twice)))
+    low = word(word(word(1) << twice) - word(1))
+    limit = min(np.int64(np.ceil(saturated)), np.int64(carry))
+    to_carry = word(word(carry - word(limit)) * word(word(1) | word(word(1) << twice)))
+    carry = word(carry | word(carry << twice))
     height, width = valid.shape
     quarter = np.float32(0.25) * scale
     half = np.float32(0.5) * quarter
     for y in range(height):
+        top, upper, lower, bottom = words[4 * y], words[4 * y + 1], words[4 * y + 2], words[4 * y + 3]
         for x in range(width):
-            i0 = i45 = i90 = i135 = np.int32(0)
-            peak = np.int32(0)
-            for row in range(4 * y, 4 * y + 4, 2):
-                for column in range(4 * x, 4 * x + 4, 2):
-                    a, b = np.int32(raw[row, column]), np.int32(raw[row, column + 1])
-                    c, d = np.int32(raw[row + 1, column]), np.int32(raw[row + 1, column + 1])
-                    i90 += a
-                    i45 += b
-                    i135 += c
-                    i0 += d
-                    peak = max(peak, max(max(a, b), max(c, d)))
+            a90, a45 = word(top[x] & quarters), word(word(top[x] >> bits) & quarters)
+            b90, b45 = word(lower[x] & quarters), word(word(lower[x] >> bits) & quarters)
+            a135, a0 = word(upper[x] & quarters), word(word(upper[x] >> bits) & quarters)
+            b135, b0 = word(bottom[x] & quarters), word(word(bottom[x] >> bits) & quarters)
+            full = word(a90 + to_carry) | word(a45 + to_carry) | word(b90 + to_carry) | word(b45 + to_carry)
+            full |= word(a135 + to_carry) | word(a0 + to_carry) | word(b135 + to_carry) | word(b0 + to_carry)
+            i90, i45, i135, i0 = word(a90 + b90), word(a45 + b45), word(a135 + b135), word(a0 + b0)
+            i90 = np.int32(word(word(i90 & low) + word(i90 >> twice)))
+            i45 = np.int32(word(word(i45 & low) + word(i45 >> twice)))
+            i135 = np.int32(word(word(i135 & low) + word(i135 >> twice)))
+            i0 = np.int32(word(word(i0 & low) + word(i0 >> twice)))
             s0 = half * np.float32(i0 + i45 + i90 + i135)
             out[0, y, x] = s0
             out[1, y, x] = quarter * np.float32(i0 - i90)
             out[2, y, x] = quarter * np.float32(i45 - i135)
-            valid[y, x] = peak < saturated and s0 >= dark
+            valid[y, x] = (word(full & carry) == 0) & (s0 >= dark)
+
+
+@_compiled
+def angle_stokes(intensities: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+    """(4, h, w) angle images to (3, h, w) Stokes."""
+    half = np.float32(0.5)
+    for y in range(out.shape[1]):
+        i0, i45, i90, i135 = intensities[0, y], intensities[1, y], intensities[2, y], intensities[3, y]
+        for x in range(out.shape[2]):
+            out[0, y, x] = half * (i0[x] + i45[x] + i90[x] + i135[x])
+            out[1, y, x] = i0[x] - i90[x]
+            out[2, y, x] = i45[x] - i135[x]
 
 
 @_compiled

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dataset.errors import ToolkitError
 from dataset.frames import SUPERPIXEL, Mosaic
-from dataset.mosaic_kernels import calibrated_stokes, colour_stokes, mono_stokes, sample_stokes
+from dataset.mosaic_kernels import angle_stokes, calibrated_stokes, colour_stokes, mono_stokes, sample_stokes
 from dataset.polarizer_response import POLARIZER_CELL, PolarizerResponse
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
@@ -55,11 +55,16 @@ class Stokes:
 
         With these four angles the normal equations are diagonal: S0 is half the sum, S1 = I0 - I90,
         S2 = I45 - I135. All pixels count as valid unless `valid` (h, w) says otherwise.
+
+        Raises:
+            ToolkitError: not four images.
         """
-        i0, i45, i90, i135 = np.asarray(intensities, dtype=np.float32)
-        if valid is None:
-            valid = np.ones(i0.shape, dtype=bool)
-        return Stokes(0.5 * (i0 + i45 + i90 + i135), i0 - i90, i45 - i135, valid)
+        images = np.ascontiguousarray(intensities, dtype=np.float32)
+        if images.ndim != 3 or len(images) != 4:
+            raise ToolkitError(f"angle images must be (4, h, w): 0, 45, 90, 135 degrees; got {images.shape}")
+        out = np.empty((3, *images.shape[1:]), np.float32)
+        angle_stokes(images, out)
+        return Stokes(out[0], out[1], out[2], np.ones(out.shape[1:], bool) if valid is None else valid)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -167,7 +172,8 @@ def decode(raw: Raw, layout: Mosaic, bits: int, response: PolarizerResponse | No
     elif layout == "mono":
         mono_stokes(pixels, scale, SATURATED * white, np.float32(DARK), out, valid)
     else:
-        colour_stokes(pixels, scale, SATURATED * white, np.float32(DARK), out, valid)
+        words = np.require(pixels.view(f"u{4 * pixels.itemsize}"), requirements="A")
+        colour_stokes(words, scale, SATURATED * white, np.float32(DARK), out, valid)
     return Stokes(out[0], out[1], out[2], valid)
 
 

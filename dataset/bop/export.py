@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dataset.bop.layout import ENCODING, EXTRA, MM, encode_stokes, write_image, write_json
+from dataset.bop.layout import ENCODING, EXTRA, read_json, tables_of, write_json
 from dataset.bop.models import write_models
+from dataset.bop.scene import Drawn, Scene
 from dataset.errors import SessionError, ToolkitError
-from dataset.frames import SUPERPIXEL
 from dataset.intrinsics import Intrinsics
-from dataset.polarimetry import split_colours, white_level
 from dataset.session import ObjectRecord, Session
-from dataset.transforms import SE3
-
-Drawn = Callable[[ObjectRecord, SE3, Intrinsics], NDArray[np.bool_]]
-"""Draws the silhouette of an object at a pose T_cam_obj: (H, W) bool of the camera's size."""
 
 Progress = Callable[[int, int], None]
 
-_TARGET_VISIBLE = 0.1
-"""The benchmark's: an instance of which less is visible is no test target."""
+_SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)?")
 
 
 def export_bop(
@@ -36,7 +32,7 @@ def export_bop(
     frames: str | None = None,
     on_progress: Progress = lambda done, total: None,
 ) -> Path:
-    """Writes annotated sessions as the scenes of a BOP data set; images are the undistorted ones.
+    """Writes annotated sessions as the scenes of one split of a BOP data set; their images are undistorted.
 
     Image ids are frame indices, scene ids the order of the sessions, object ids the order of the objects'
     names, from 1. `rgb` (colour sensors) or `gray` is the mean over the polarizer angles, 8 bit, linear.
@@ -44,9 +40,9 @@ def export_bop(
 
     Args:
         paths: of complete, annotated sessions.
-        out: a folder to be.
+        out: a folder to be, or an export that lacks this split and has the same objects.
         draw: draws the whole silhouettes; sessions hold the visible ones.
-        split: the BOP name of the split, such as "test" or "train_pbr".
+        split: the BOP name of the split, such as "test" or "train_real".
         frames: name of the session's split to which the export is limited; all frames when None.
         on_progress: called with (frames written, frames in all).
 
@@ -55,162 +51,75 @@ def export_bop(
 
     Raises:
         SessionError: a session is incomplete, damaged, not calibrated or not annotated.
-        ToolkitError: the folder is not empty, or objects of one name differ.
+        ToolkitError: the folder holds something else, the split's name is not BOP's, or objects of one name
+            differ.
     """
-    out = Path(out)
-    if out.exists() and any(out.iterdir()):
-        raise ToolkitError(f"{out} is not empty; name a new folder for the BOP data set")
-    records = _objects([Path(path) for path in paths])
+    out, sessions = Path(out), [Path(path) for path in paths]
+    if not _SPLIT.fullmatch(split):
+        raise ToolkitError(f"--split {split}: BOP's are train, val and test, with a type such as train_real")
+    records = _objects(sessions)
     ids = {name: index for index, name in enumerate(sorted(records), start=1)}
+    described = {str(ids[name]): _described(record) for name, record in records.items()}
+    begun = _begun(out, split, described)
+    partial = out / f".{split}.partial"
+    try:
+        camera, targets = _write_scenes(partial, sessions, records, ids, draw, frames, on_progress)
+        if not begun:
+            write_json(out / "camera.json", _camera(camera))
+            write_models(out, {ids[name]: record for name, record in records.items()})
+            write_json(out / EXTRA, {"objects": described, "stokes": ENCODING})
+        if split.startswith("test"):
+            write_json(out / "test_targets_bop19.json", targets)
+        partial.rename(out / split)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        with suppress(OSError):  # it is not empty
+            out.rmdir()
+    return out
+
+
+def _begun(out: Path, split: str, described: dict[str, Any]) -> bool:
+    """Whether the folder holds an export that this split can join. Raises ToolkitError: it holds something
+    else."""
+    if not out.exists() or not any(out.iterdir()):
+        return False
+    if not (out / EXTRA).is_file():
+        raise ToolkitError(f"{out} is not empty; name a new folder for the BOP data set")
+    names = {path.name for path in out.iterdir()}
+    if split in names or (split.startswith("test") and "test_targets_bop19.json" in names):
+        raise ToolkitError(f"{out} has its {split.split('_')[0]} split already; name a new folder")
+    with tables_of(out):
+        if read_json(out / EXTRA)["objects"] != described:
+            raise ToolkitError(f"{out} is of other objects; name a new folder for the BOP data set")
+    return True
+
+
+def _write_scenes(
+    folder: Path,
+    paths: Sequence[Path],
+    records: dict[str, ObjectRecord],
+    ids: dict[str, int],
+    draw: Drawn,
+    frames: str | None,
+    on_progress: Progress,
+) -> tuple[Intrinsics, list[dict[str, int]]]:
+    """Writes one scene a session; returns the first one's camera and the targets of all."""
+    shutil.rmtree(folder, ignore_errors=True)
     targets: list[dict[str, int]] = []
-    total, done = sum(len(_frames(Path(path), frames)) for path in paths), 0
-    camera = None
+    total, done = sum(len(_frames(path, frames)) for path in paths), 0
+    cameras = []
     for scene, path in enumerate(paths):
         with Session.open(path) as session:
-            chosen = _frames(Path(path), frames)
-            writer = _Scene(
-                session,
-                out / split / f"{scene:06d}",
-                {n: records[n] for n in session.contents.names("poses/objects")},
-                ids,
-                draw,
-            )
-            for index in chosen:
+            annotated = {name: records[name] for name in session.contents.names("poses/objects")}
+            writer = Scene(session, folder / f"{scene:06d}", annotated, ids, draw)
+            for index in _frames(path, frames):
                 writer.add(int(index))
                 done += 1
                 on_progress(done, total)
             writer.finish()
             targets += writer.targets(scene)
-            camera = camera or session.working_intrinsics
-    assert camera is not None
-    write_json(out / "camera.json", _camera(camera))
-    write_json(out / "test_targets_bop19.json", targets)
-    write_models(out, {ids[name]: record for name, record in records.items()})
-    write_json(
-        out / EXTRA, {"objects": {ids[n]: _material(r) for n, r in records.items()}, "stokes": ENCODING}
-    )
-    return out
-
-
-class _Scene:
-    """One session as one scene folder."""
-
-    def __init__(
-        self,
-        session: Session,
-        folder: Path,
-        records: dict[str, ObjectRecord],
-        ids: dict[str, int],
-        draw: Drawn,
-    ) -> None:
-        self.session, self.folder, self.records, self.ids, self.draw = session, folder, records, ids, draw
-        self.camera = session.working_intrinsics
-        height, width = self.camera.height, self.camera.width
-        shift = np.array([[0, 0, width], [0, 0, height], [0, 0, 0]])
-        # the image in the middle of a canvas: what lies outside it belongs to the silhouette, too
-        self.canvas = Intrinsics(self.camera.K + shift, self.camera.distortion, 3 * height, 3 * width)
-        assert session.intrinsics is not None
-        self.maps = session.intrinsics.at(SUPERPIXEL[session.camera.mosaic]).undistort_map()
-        self.cameras: dict[int, dict[str, Any]] = {}
-        self.truth: dict[int, list[dict[str, Any]]] = {}
-        self.infos: dict[int, list[dict[str, Any]]] = {}
-
-    def add(self, index: int) -> None:
-        """Writes the images of a frame and notes its annotation."""
-        session, name = self.session, f"{index:06d}"
-        write_image(self.folder / "stokes" / f"{name}.png", encode_stokes(session.stokes(index).stack()))
-        kind = "rgb" if session.camera.mosaic == "colour" else "gray"
-        write_image(self.folder / kind / f"{name}.png", self._intensity(index))
-        depth = None
-        if session.has_depth:
-            depth = np.rint(session.depth(index) * MM).astype(np.uint16)
-            write_image(self.folder / "depth" / f"{name}.png", depth)
-        self.cameras[index] = {
-            "cam_K": self.camera.K.ravel().tolist(),
-            "depth_scale": 1.0,
-            **self._world(index),
-        }
-        self.truth[index], self.infos[index] = [], []
-        for object_name, record in self.records.items():
-            poses = session.object_poses(object_name)
-            pose = poses.T_cam_obj[index]
-            if not pose.finite:
-                continue
-            whole = self.draw(record, pose, self.canvas)
-            visible = poses.mask(index)
-            label = f"{name}_{len(self.truth[index]):06d}.png"
-            height, width = visible.shape
-            inside = whole[height : 2 * height, width : 2 * width]
-            write_image(self.folder / "mask" / label, 255 * inside.astype(np.uint8))
-            write_image(self.folder / "mask_visib" / label, 255 * visible.astype(np.uint8))
-            rotation, translation = pose.rotation.ravel().tolist(), (pose.translation * MM).tolist()
-            self.truth[index].append(
-                {"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": self.ids[object_name]}
-            )
-            self.infos[index].append(_info(whole, visible, inside, depth))
-
-    def finish(self) -> None:
-        """Writes the scene's tables."""
-        write_json(self.folder / "scene_camera.json", self.cameras)
-        write_json(self.folder / "scene_gt.json", self.truth)
-        write_json(self.folder / "scene_gt_info.json", self.infos)
-
-    def targets(self, scene: int) -> list[dict[str, int]]:
-        """Rows of test_targets_bop19.json."""
-        return [
-            {"im_id": index, "inst_count": 1, "obj_id": truth["obj_id"], "scene_id": scene}
-            for index in self.truth
-            for truth, info in zip(self.truth[index], self.infos[index], strict=True)
-            if info["visib_fract"] >= _TARGET_VISIBLE
-        ]
-
-    def _intensity(self, index: int) -> NDArray[np.uint8]:
-        """(h, w, 3) or (h, w): mean over the four angles, undistorted, white = 255."""
-        camera = self.session.camera
-        if camera.mosaic == "colour":
-            mean = split_colours(self.session.mosaic(index)).mean(axis=0) / white_level(camera.bits)
-        else:
-            mean = self.session.stokes(index, undistort=False).s0 / 2
-        flat = cv2.remap(mean.astype(np.float32), *self.maps, cv2.INTER_LINEAR)
-        counts: NDArray[np.uint8] = np.clip(np.rint(255 * flat), 0, 255).astype(np.uint8)
-        return counts
-
-    def _world(self, index: int) -> dict[str, list[float]]:
-        """The optional pose of the world, here the arm's base, in the camera."""
-        poses = self.session.poses
-        if poses is None or not poses[index].finite:
-            return {}
-        T_cam_base = poses[index].inverse()
-        return {
-            "cam_R_w2c": T_cam_base.rotation.ravel().tolist(),
-            "cam_t_w2c": (T_cam_base.translation * MM).tolist(),
-        }
-
-
-def _info(
-    whole: NDArray[np.bool_],
-    visible: NDArray[np.bool_],
-    inside: NDArray[np.bool_],
-    depth: NDArray[np.uint16] | None,
-) -> dict[str, Any]:
-    height, width = visible.shape
-    count, seen = int(whole.sum()), int(visible.sum())
-    return {
-        "bbox_obj": _box(whole, (width, height)),
-        "bbox_visib": _box(visible, (0, 0)),
-        "px_count_all": count,
-        "px_count_valid": 0 if depth is None else int((depth[inside] > 0).sum()),
-        "px_count_visib": seen,
-        "visib_fract": min(seen / count, 1.0) if count else 0.0,
-    }
-
-
-def _box(mask: NDArray[np.bool_], origin: tuple[int, int]) -> list[int]:
-    rows, columns = np.nonzero(mask)
-    if len(rows) == 0:
-        return [-1, -1, -1, -1]
-    left, top = int(columns.min()), int(rows.min())
-    return [left - origin[0], top - origin[1], int(columns.max()) - left, int(rows.max()) - top]
+            cameras.append(session.working_intrinsics)
+    return cameras[0], targets
 
 
 def _frames(path: Path, split: str | None) -> NDArray[np.int64]:
@@ -250,10 +159,11 @@ def _camera(camera: Intrinsics) -> dict[str, float]:
     }
 
 
-def _material(record: ObjectRecord) -> dict[str, Any]:
+def _described(record: ObjectRecord) -> dict[str, Any]:
     return {
         "name": record.name,
         "material": record.material,
         "refractive_index": record.refractive_index,
         "extinction": record.extinction,
+        "sha256": record.sha256,
     }

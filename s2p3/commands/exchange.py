@@ -69,8 +69,8 @@ def export_bop(sessions: Sessions, *, out: Path, split: str = "test", frames: Op
 
     Args:
         sessions: one session a scene.
-        out: the new folder.
-        split: name of the BOP split.
+        out: the new folder, or one exported before, which gets one more split.
+        split: name of the BOP split: train, val or test, perhaps with a type, such as train_real.
         frames: a split stored in the sessions to which the export is limited, such as test.
     """
     from dataset.bop import export_bop as write

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from dataset import SE3, Intrinsics, SessionError, ToolkitError
 from dataset.bop import export_bop, import_bop
 from dataset.bop.layout import decode_stokes, encode_stokes, read_image
-from dataset.session import ObjectRecord, Session
+from dataset.session import ObjectRecord, Session, write_object
 from dataset.validate import validate
 
 
@@ -44,6 +46,34 @@ def test_the_layout_is_the_described_one(exported: Path) -> None:
     expected |= {f"{scene}/{kind}/{image}.png" for kind in ("rgb", "depth", "stokes") for image in images}
     expected |= {f"{scene}/{kind}/{image}_000000.png" for kind in ("mask", "mask_visib") for image in images}
     assert found == expected
+
+
+def test_a_data_set_may_have_a_split_more(
+    exported: Path, recorded: Path, tetrahedron: ObjectRecord, tmp_path: Path
+) -> None:
+    before = {path: path.read_bytes() for path in exported.rglob("*") if path.is_file()}
+    export_bop([recorded], exported, draw, "train_real", "train")
+    assert sorted(path.name for path in exported.iterdir() if path.is_dir()) == [
+        "models", "models_eval", "test", "train_real"
+    ]  # fmt: skip
+    assert len(list((exported / "train_real/000000/stokes").iterdir())) == 9
+    assert all(path.read_bytes() == content for path, content in before.items())
+    for split in ("test", "test_dark", "train_real"):
+        with pytest.raises(ToolkitError, match="split already"):
+            export_bop([recorded], exported, draw, split)
+    write_object(recorded, replace(tetrahedron, vertices=1.1 * tetrahedron.vertices))
+    with pytest.raises(ToolkitError, match="of other objects"):
+        export_bop([recorded], exported, draw, "val")
+    with pytest.raises(ToolkitError, match="BOP's are train, val and test"):
+        export_bop([recorded], tmp_path / "new", draw, "../test")
+
+
+def test_an_export_that_fails_leaves_nothing(recorded: Path, tmp_path: Path) -> None:
+    with h5py.File(recorded, "r+") as file:
+        file["camera/raw"].id.write_direct_chunk((4, 0, 0), b"\0" * 40)
+    with pytest.raises(SessionError, match="damaged"):
+        export_bop([recorded], tmp_path / "new", draw)
+    assert not (tmp_path / "new").exists()
 
 
 def tables(root: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
@@ -103,8 +133,6 @@ def test_targets_are_the_instances_that_can_be_seen(exported: Path) -> None:
 
 
 def test_symmetries_travel_in_millimetres(recorded: Path, tmp_path: Path) -> None:
-    from dataclasses import replace
-
     from dataset.bop.models import read_models, write_models
 
     half_turn = np.diag([-1.0, -1, 1, 1])
@@ -162,7 +190,7 @@ def test_an_export_comes_back(exported: Path, recorded: Path, tmp_path: Path) ->
 
 def test_mistakes_get_one_line(recorded: Path, exported: Path, tmp_path: Path) -> None:
     with pytest.raises(ToolkitError, match="not empty"):
-        export_bop([recorded], exported, draw)
+        export_bop([recorded], recorded.parent, draw)
     with pytest.raises(SessionError, match="no split 'x'"):
         export_bop([recorded], tmp_path / "new", draw, frames="x")
     scene = exported / "test" / "000000"

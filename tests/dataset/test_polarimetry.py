@@ -120,28 +120,54 @@ def test_a_mosaic_round_trips(layout: Mosaic, bits: int) -> None:
     np.testing.assert_allclose(found.stack(), stokes.stack(), atol=step)
 
 
+def least_squares(angles: np.ndarray) -> np.ndarray:
+    """(4, h, w) intensities to (3, h, w) Stokes, as a matrix: Malus' law for the four angles, inverted."""
+    double = 2 * np.deg2rad(ANGLES_DEG)
+    malus = 0.5 * np.stack([np.ones(4), np.cos(double), np.sin(double)], axis=1)
+    return np.tensordot(np.linalg.pinv(malus), angles, axes=1)
+
+
 @layouts
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_the_fast_decoder_equals_the_plain_one(layout: Mosaic, dtype: type) -> None:
-    bits = 8 if dtype is np.uint8 else 12
-    raw = np.random.default_rng(0).integers(0, 1 << bits, (32, 48)).astype(dtype)
-    angles = split_angles(raw).astype(np.float64) / ((1 << bits) - 1)
+@pytest.mark.parametrize("bits", [8, 12, 16])
+@pytest.mark.parametrize("columns", [4, 48, 140])
+def test_the_fast_decoder_equals_the_plain_one(layout: Mosaic, bits: int, columns: int) -> None:
+    white = (1 << bits) - 1
+    rng = np.random.default_rng(bits)
+    raw = rng.integers(0, int(0.993 * white), (32, columns)).astype(np.uint8 if bits == 8 else np.uint16)
+    near = rng.random(raw.shape) < 0.1  # the limit, one below it, and white
+    raw[near] = rng.choice([int(np.ceil(0.995 * white)) - 1, int(np.ceil(0.995 * white)), white], near.sum())
+    angles = split_angles(raw).astype(np.float64) / white
     if layout == "colour":
-        angles = angles.reshape(4, 8, 2, 12, 2).mean(axis=(2, 4))
-    expected = Stokes.from_angles(angles)
+        angles = angles.reshape(4, 8, 2, columns // 4, 2).mean(axis=(2, 4))
+    expected = least_squares(angles)
     found = decode(raw, layout, bits)
-    np.testing.assert_allclose(found.stack(), expected.stack(), atol=2e-6)
+    np.testing.assert_allclose(found.stack(), expected, atol=2e-6)
     size = superpixel(layout)
-    peak = raw.reshape(32 // size, size, 48 // size, size).max(axis=(1, 3))
-    np.testing.assert_array_equal(found.valid, (peak < 0.995 * ((1 << bits) - 1)) & (expected.s0 >= 0.01))
+    peak = raw.reshape(32 // size, size, columns // size, size).max(axis=(1, 3))
+    np.testing.assert_array_equal(found.valid, (peak < 0.995 * white) & (expected[0] >= 0.01))
+    np.testing.assert_allclose(Stokes.from_angles(angles).stack(), expected, atol=2e-6)
 
 
-def test_read_only_and_strided_mosaics_decode() -> None:
+def test_eight_bits_that_count_as_twelve_are_never_saturated() -> None:
+    assert decode(np.full((8, 8), 255, np.uint8), "colour", 12).valid.all()
+
+
+@pytest.mark.parametrize("shape", [(3, 4, 4), (4, 4), (5, 4, 4)])
+def test_angle_images_are_four(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ToolkitError, match=r"\(4, h, w\)"):
+        Stokes.from_angles(np.zeros(shape))
+
+
+def test_read_only_strided_and_unaligned_mosaics_decode() -> None:
     raw = np.random.default_rng(0).integers(0, 255, (16, 16)).astype(np.uint8)
-    expected = decode(raw, "mono", 8).stack()
     wide = np.repeat(raw, 2, axis=1)[:, ::2]
     wide.flags.writeable = False
-    np.testing.assert_array_equal(decode(wide, "mono", 8).stack(), expected)
+    odd = np.zeros(raw.size + 1, np.uint8)[1:].reshape(raw.shape)  # as in a buffer behind a header
+    odd[:] = raw
+    for layout in ("mono", "colour"):
+        expected = decode(raw, layout, 8).stack()
+        for other in (wide, odd):
+            np.testing.assert_array_equal(decode(other, layout, 8).stack(), expected)
 
 
 @layouts

@@ -1,6 +1,7 @@
 """Simulated devices that whole test modules share. They own fixed ports: one of a kind at a time."""
 
 import base64
+import os
 from collections.abc import Callable, Iterator
 
 import cv2
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from playwright.sync_api import Page, expect, sync_playwright
 
 from acquisition.simulation.camera import SimulatedCamera
+
+collect_ignore = [] if "S2P3_RIG" in os.environ else ["hardware"]  # those tests need a lab's own devices
 
 CHROMIUM = "/usr/bin/chromium"
 CHROMIUM_ARGUMENTS = (

@@ -4,6 +4,7 @@ import socket
 import subprocess
 import sys
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -103,6 +104,25 @@ def test_a_source_that_fails_takes_the_camera_down_and_says_why(
                 camera.read()
         with pytest.raises(DeviceError, match="the lamp broke"):
             simulated.command("statistics")
+
+
+def test_ids_and_times_grow_over_the_wrap_of_the_counter() -> None:
+    with (
+        SimulatedCamera(**{**SMALL, "frame_rate": 250}),
+        AravisCamera(CameraConfig("127.0.0.1")) as camera,
+    ):
+        camera.start()
+        frames = [camera.read()]
+        while len(frames) < 50 or frames[-1].frame_id < 65_600:
+            frames.append(camera.read())
+        statistics = camera.statistics
+    ids = [frame.frame_id for frame in frames]
+    assert ids[0] < 65_535  # the simulated counter of 16 bits begins at 65,401
+    assert ids == sorted(set(ids))
+    lost = statistics.incomplete + statistics.discarded
+    assert len(ids) <= ids[-1] - ids[0] + 1 <= len(ids) + lost
+    assert all(a.camera_time_ns < b.camera_time_ns for a, b in pairwise(frames))
+    assert all(a.host_time_ns < b.host_time_ns for a, b in pairwise(frames))
 
 
 def test_the_cameras_clock_drifts() -> None:

@@ -92,11 +92,12 @@ def colour_stokes(
 
 
 @_compiled
-def angle_stokes(intensities: NDArray[np.float32], out: NDArray[np.float32]) -> None:
-    """(4, h, w) angle images to (3, h, w) Stokes."""
+def angle_stokes(intensities: NDArray[np.float32], top: int, out: NDArray[np.float32]) -> None:
+    """Rows `top` to `top + h` of (4, H, w) angle images to (3, h, w) Stokes."""
     half = np.float32(0.5)
     for y in range(out.shape[1]):
-        i0, i45, i90, i135 = intensities[0, y], intensities[1, y], intensities[2, y], intensities[3, y]
+        i0, i45 = intensities[0, top + y], intensities[1, top + y]
+        i90, i135 = intensities[2, top + y], intensities[3, top + y]
         for x in range(out.shape[2]):
             out[0, y, x] = half * (i0[x] + i45[x] + i90[x] + i135[x])
             out[1, y, x] = i0[x] - i90[x]

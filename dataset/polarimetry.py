@@ -59,11 +59,9 @@ class Stokes:
         Raises:
             ToolkitError: not four images.
         """
-        images = np.ascontiguousarray(intensities, dtype=np.float32)
-        if images.ndim != 3 or len(images) != 4:
-            raise ToolkitError(f"angle images must be (4, h, w): 0, 45, 90, 135 degrees; got {images.shape}")
+        images = as_angles(intensities)
         out = np.empty((3, *images.shape[1:]), np.float32)
-        angle_stokes(images, out)
+        angle_stokes(images, 0, out)
         return Stokes(out[0], out[1], out[2], np.ones(out.shape[1:], bool) if valid is None else valid)
 
     @property
@@ -108,6 +106,20 @@ def white_level(bits: int) -> int:
     return (1 << bits) - 1
 
 
+def as_angles(intensities: NDArray[np.floating]) -> Image:
+    """Angle images (4, h, w) as contiguous float32.
+
+    Raises:
+        ToolkitError: of another shape.
+    """
+    images = np.ascontiguousarray(intensities, dtype=np.float32)
+    if images.ndim != 3 or len(images) != 4:
+        raise ToolkitError(
+            f"angle images must be (4, h, w), at {ANGLES_DEG} degrees; these are of shape {images.shape}"
+        )
+    return images
+
+
 def split_angles(raw: Raw) -> Raw:
     """The mosaic (H, W) as (4, H/2, W/2) angle images in its own dtype; each of a colour sensor's holds a
     Bayer mosaic with red at the top left.
@@ -115,7 +127,7 @@ def split_angles(raw: Raw) -> Raw:
     Raises:
         ToolkitError: H or W is odd.
     """
-    _check_mosaic(raw, 2)
+    check_mosaic(raw, 2)
     angles: Raw = np.empty((4, raw.shape[0] // 2, raw.shape[1] // 2), raw.dtype)
     for image, (row, column) in zip(angles, _SITES, strict=True):
         image[:] = raw[row::2, column::2]
@@ -129,7 +141,7 @@ def split_colours(raw: Raw) -> Image:
     Raises:
         ToolkitError: H or W is not a multiple of 4.
     """
-    _check_mosaic(raw, 4)
+    check_mosaic(raw, 4)
     bayer = split_angles(raw).astype(np.float32)
     green = 0.5 * (bayer[:, 0::2, 1::2] + bayer[:, 1::2, 0::2])
     return np.stack([bayer[:, 0::2, 0::2], green, bayer[:, 1::2, 1::2]], axis=-1)
@@ -153,7 +165,7 @@ def decode(raw: Raw, layout: Mosaic, bits: int, response: PolarizerResponse | No
             response of another size.
     """
     size = superpixel(layout)
-    _check_mosaic(raw, size)
+    check_mosaic(raw, size)
     height, width = raw.shape[0] // size, raw.shape[1] // size
     out = np.empty((3, height, width), np.float32)
     valid = np.empty((height, width), np.bool_)
@@ -240,7 +252,8 @@ def remap(stokes: Stokes, map_x: Image, map_y: Image) -> Stokes:
     return Stokes(s0, s1, s2, valid > 0.999)
 
 
-def _check_mosaic(raw: Raw, size: int) -> None:
+def check_mosaic(raw: Raw, size: int) -> None:
+    """Raises a ToolkitError unless `raw` is a mosaic of whole super-pixels of this size."""
     if raw.ndim != 2 or raw.shape[0] % size or raw.shape[1] % size or raw.size == 0:
         raise ToolkitError(
             f"a raw mosaic must be a (H, W) image of whole {size}x{size} super-pixels, got shape {raw.shape}"

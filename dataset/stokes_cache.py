@@ -9,6 +9,8 @@ goes.
 from __future__ import annotations
 
 import hashlib
+import io
+import math
 import os
 import shutil
 from collections.abc import Callable
@@ -35,12 +37,12 @@ def cached_stokes(path: str | Path, on_progress: Progress = lambda done, total: 
     same. Reading from it needs no lock and works in any number of processes.
 
     Raises:
-        SessionError: the session is not calibrated or damaged, or the disk has no room for the array.
+        SessionError: the session is not calibrated or damaged, or the array cannot be written beside it.
     """
     path = Path(path)
     with Session.open(path) as session:
         target = cache_path(session)
-        if not target.exists():
+        if not target.exists() or target.stat().st_size != _size(session):  # a copy cut short, for one
             _make(session, target, on_progress)
     for stale in path.parent.glob(f".{path.name}.stokes-*.npy"):
         if stale != target:
@@ -60,10 +62,24 @@ def cache_path(session: Session) -> Path:
     return session.path.with_name(f".{session.path.name}.stokes-{digest.hexdigest()[:16]}.npy")
 
 
+def _shape(session: Session) -> tuple[int, int, int, int]:
+    return (len(session), *session.camera.working_size, 3)
+
+
+def _header(session: Session) -> bytes:
+    stream = io.BytesIO()
+    layout = {"descr": "<f2", "fortran_order": False, "shape": _shape(session)}
+    np.lib.format.write_array_header_1_0(stream, layout)
+    return stream.getvalue()
+
+
+def _size(session: Session) -> int:
+    """Bytes of the array's file."""
+    return len(_header(session)) + 2 * math.prod(_shape(session))
+
+
 def _make(session: Session, target: Path, on_progress: Progress) -> None:
-    height, width = session.camera.working_size
-    shape = (len(session), height, width, 3)
-    size = 2 * int(np.prod(shape))
+    size = _size(session)
     if shutil.disk_usage(target.parent).free < size + (1 << 28):
         raise SessionError(
             f"{session.path}: its decoded images need {size / 1e9:.1f} GB beside it; make room, or copy the "
@@ -71,11 +87,18 @@ def _make(session: Session, target: Path, on_progress: Progress) -> None:
         )
     partial = target.with_suffix(f".{os.getpid()}.partial")
     try:
-        array = np.lib.format.open_memmap(partial, mode="w+", dtype=np.float16, shape=shape)
-        for index in range(len(session)):
-            array[index] = np.moveaxis(session.stokes(index).stack(), 0, -1)
-            on_progress(index + 1, len(session))
-        array.flush()
+        # written, not mapped: a disk that fills up meanwhile is then an error, not a crash
+        with partial.open("wb") as stream:
+            stream.write(_header(session))
+            for index in range(len(session)):
+                image = np.moveaxis(session.stokes(index).stack(), 0, -1)
+                stream.write(np.ascontiguousarray(image, "<f2").data)
+                on_progress(index + 1, len(session))
         os.replace(partial, target)
+    except OSError as error:
+        raise SessionError(
+            f"{session.path}: its decoded images cannot be written beside it ({error.strerror}); copy the "
+            "session to a folder that may be written to, on a disk with room"
+        ) from error
     finally:
         partial.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,6 +58,24 @@ def test_other_pixels_make_a_new_one(recorded: Path) -> None:
         file["camera/crc32"][4] = chunk.crc32
         seal(file)
     assert not np.array_equal(cached_stokes(recorded)[4], before)
+
+
+def test_one_that_was_cut_short_is_made_again(recorded: Path) -> None:
+    whole = cached_stokes(recorded).copy()
+    (path,) = caches(recorded)
+    path.write_bytes(path.read_bytes()[:-100])
+    np.testing.assert_array_equal(cached_stokes(recorded), whole)
+
+
+def test_a_disk_that_refuses_is_an_error(recorded: Path) -> None:
+    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, unlimited[1]))
+    try:
+        with pytest.raises(SessionError, match="cannot be written beside it"):
+            cached_stokes(recorded)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    assert caches(recorded) == []
 
 
 def test_a_damaged_session_leaves_no_cache(recorded: Path) -> None:

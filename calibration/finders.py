@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +13,9 @@ from calibration.board import BoardSpec, dictionary
 
 MIN_CORNERS = 6
 """A view with fewer corners is not used (our choice): a pose needs 4, and two more let an error show."""
+
+_OTHER_MARKER = 0.15
+"""A marker whose side is that far off, relatively, is not the one described: blur makes up to half of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +61,23 @@ def board_homography(found: Detection, spec: BoardSpec) -> NDArray[np.float64] |
 
 
 def _charuco(grey: NDArray[np.uint8], spec: BoardSpec) -> Detection | None:
-    corners, ids, _, _ = cv2.aruco.CharucoDetector(spec.aruco).detectBoard(grey)
+    corners, ids, markers, _ = cv2.aruco.CharucoDetector(spec.aruco).detectBoard(grey)
     if ids is None:
         return None
-    return Detection(
+    found = Detection(
         np.asarray(ids).reshape(-1).astype(np.int64), np.asarray(corners).reshape(-1, 2).astype(np.float64)
     )
+    H = board_homography(found, spec) if len(found) >= MIN_CORNERS else None
+    if H is None or abs(_marker_side(markers, H) / spec.marker_m - 1) > _OTHER_MARKER:
+        return None
+    return found
+
+
+def _marker_side(outlines: Sequence[NDArray[np.generic]], H: NDArray[np.float64]) -> float:
+    """Median side of markers seen, on the board, metres."""
+    pixels = np.asarray(outlines, np.float64).reshape(-1, 4, 2)
+    on_board = cv2.perspectiveTransform(pixels, np.linalg.inv(H))
+    return float(np.median(np.linalg.norm(on_board - np.roll(on_board, 1, axis=1), axis=2)))
 
 
 def _aprilgrid(grey: NDArray[np.uint8], spec: BoardSpec) -> Detection | None:

@@ -37,6 +37,7 @@ _MAX_ERROR = 5.0  # of the views' median error: farther off is an outlier
 _NO_ARM_M = 10e-3  # a typical arm is never this wrong: the poses are not what they are taken for
 _NO_ARM_RAD = np.radians(2.0)
 _WRONG_SCALE = 0.02
+_ODD_SCALE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,9 +370,14 @@ def _reject_outlier_views(state: HandEyeState, observations: Observations) -> tu
 
 
 def _board_scale(found: Fit, observations: Observations) -> tuple[float, float]:
+    """How large the board is against its description, and the standard deviation of that."""
     free = found.free.copy()
     free[SCALE] = True
     scaled, solution = replace(found, free=free).again(found.state, observations)
+    if abs(scaled.scale - 1) > _ODD_SCALE:
+        # A wrong size passes for noise of the arm, and would hide behind it.
+        refit = fit(found.state, observations, free, found.information)
+        scaled, solution = refit.state, refit.solution
     place = int(np.count_nonzero(free[:SCALE]))
     return scaled.scale, float(np.sqrt(solution.covariance[place, place]))
 

@@ -59,7 +59,7 @@ def _left_out(used: NDArray[np.bool_], rms_px: NDArray[np.float64], frames: Sequ
     left_out = np.flatnonzero(~used)
     if len(left_out) == 0:
         return []
-    named = ", ".join(f"{frames[i]} ({rms_px[i]:.1f} px)" for i in left_out[:_MOST_NAMED])
+    named = ", ".join(f"{frames[i]} ({rms_px[i]:.2g} px)" for i in left_out[:_MOST_NAMED])
     more = f" and {len(left_out) - _MOST_NAMED} more" if len(left_out) > _MOST_NAMED else ""
     usual = float(np.median(rms_px[used]))
-    return [f"left out as outliers, against {usual:.2f} px of the others: frame {named}{more}"]
+    return [f"left out as outliers, against {usual:.2g} px of the others: frame {named}{more}"]

@@ -336,7 +336,7 @@ def _overlays(
             html.figure(
                 plots.overlay(grey, seen, seen + residual_px[corners], 2),
                 f"Frame {labels[shown.view]}: corners seen (rings) and predicted (crosses), on S0.",
-                6,
+                4,
             )
         )
     return drawn

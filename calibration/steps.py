@@ -73,10 +73,11 @@ def add_intrinsics(
 
 @dataclass(frozen=True, eq=False)
 class HandEyeStep:
-    """What was added, its 95 % bootstrap intervals, and the view to take next for a better one; None where no
-    further view of the board is within reach."""
+    """What was added, the intrinsics if they were refined, 95 % bootstrap intervals, and the view to take
+    next; None where no further view of the board is within reach."""
 
     record: HandEyeRecord | FixedCameraRecord
+    refined: IntrinsicsRecord | None
     intervals: Intervals
     advice: NextPose | None
 
@@ -122,7 +123,8 @@ def add_hand_eye(
         pictures = _pictures(opened, views)
     frames = [index for index, _ in views]
     warnings = remarks.of_hand_eye(result, frames)
-    changed = Calibration(board=spec, intrinsics=_refined(known.intrinsics, result, source))
+    refined = _refined(known.intrinsics, result, source)
+    changed = Calibration(board=spec, intrinsics=refined)
     record: HandEyeRecord | FixedCameraRecord
     if mount == "eye_in_hand":
         record = HandEyeRecord.of(result, (source,), warnings)
@@ -130,7 +132,7 @@ def add_hand_eye(
     else:
         record = FixedCameraRecord.of(result, (source,), warnings)
         known.merged(replace(changed, fixed_camera=record)).save(calibration)
-    step = HandEyeStep(record, bootstrap(result), _advice(result, spec, reachable))
+    step = HandEyeStep(record, refined, bootstrap(result), _advice(result, spec, reachable))
     page = hand_eye_report(
         spec, result, frames, pictures, step.intervals, step.advice, warnings, str(session)
     )

@@ -16,7 +16,7 @@ from s2p3.commands.output import counting, say
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from calibration import BoardSpec
+    from calibration import BoardSpec, IntrinsicsRecord
     from calibration.closed_forms import Mount
     from calibration.next_pose import Reachable
     from dataset.transforms import SE3
@@ -83,11 +83,7 @@ def intrinsics(
 
     with counting("detect the board") as report:
         done = add_intrinsics(session, board_of(rig), calibration, report)
-    fx = done.intrinsics.K[0, 0]
-    say(
-        f"fx {fx:.2f} +- {done.covariance[0, 0] ** 0.5:.2f} px, "
-        f"reprojection {done.rms_px:.3f} px, held out {done.held_out_px:.3f} px"
-    )
+    say(f"{_focal(done)}, reprojection {done.rms_px:.3f} px, held out {done.held_out_px:.3f} px")
     _warn(done.warnings)
     _apply(calibration, apply)
 
@@ -122,6 +118,8 @@ def hand_eye(
         f"hand-eye from {done.views} views: held out {done.held_out_mm:.3f} mm, {done.held_out_deg:.4f} deg;"
         f" 95 % within {step.intervals.half_mm.max():.3f} mm, {step.intervals.half_deg.max():.4f} deg an axis"
     )
+    if step.refined is not None:
+        say(f"intrinsics refined: {_focal(step.refined)}")
     _warn(done.warnings)
     if advice is None:
         say("next view: none that was tried shows the board within the arm's reach")
@@ -247,6 +245,10 @@ def object_pose(
     blind = f"; not observable: {', '.join(done.unobservable)}" if done.unobservable else ""
     say(f"{object} from {done.points} points: {1e3 * done.rms_m:.3f} mm from the surface{blind}")
     _apply(calibration, apply)
+
+
+def _focal(record: IntrinsicsRecord) -> str:
+    return f"fx {record.intrinsics.K[0, 0]:.2f} +- {record.covariance[0, 0] ** 0.5:.2f} px"
 
 
 def _warn(warnings: tuple[str, ...]) -> None:

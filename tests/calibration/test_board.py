@@ -1,5 +1,7 @@
 """The board's description: what it refuses, where its corners are, and that drawing and detection agree."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -53,6 +55,8 @@ def test_the_drawn_board_is_detected_where_it_was_drawn(dtype):
         (BoardSpec(6, 5, 0.04, 0.03, "DICT_6X6_50"), False, "DICT_4X4_"),
         (BoardSpec(4, 5, 0.04, 0.03, "DICT_4X4_50"), False, "squares_x or squares_y is too small"),
         (BoardSpec(7, 6, 0.04, 0.03, "DICT_4X4_50"), False, "do not lie as on"),
+        (replace(SPEC, marker_m=0.022), False, "marker_m / square_m"),
+        (replace(SPEC, marker_m=0.037), False, "marker_m / square_m"),
         (SPEC, True, "mirrored"),
     ],
 )

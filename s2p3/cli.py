@@ -11,7 +11,8 @@ from typing import Any
 import tyro
 
 from dataset.errors import ToolkitError
-from s2p3.commands import calibrate, capture, console, demo, devices, exchange, learn, sessions, use
+from s2p3.commands import calibrate, capture, console, demo, devices, exchange, learn, sessions, train, use
+from s2p3.commands.experiment import with_defaults
 
 Verb = Callable[..., Any]
 
@@ -74,10 +75,10 @@ VERBS: dict[str, Verb | Group] = {
     "train": Group(
         "Train the networks, on synthetic sessions first, then on captured ones",
         {
-            "detector": learn.train_detector,
-            "teacher": learn.train_teacher,
-            "student": learn.train_student,
-            "self-supervised": learn.train_self_supervised,
+            "detector": train.train_detector,
+            "teacher": train.train_teacher,
+            "student": train.train_student,
+            "self-supervised": train.train_self_supervised,
         },
     ),
     "evaluate": use.evaluate,
@@ -131,6 +132,7 @@ def _dispatch(words: list[str]) -> None:
 
 def _run(verbs: dict[str, Verb], prog: str, description: str, words: list[str]) -> None:
     config = (tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
+    verbs = {name: with_defaults(verb, words) for name, verb in verbs.items()}
     tyro.extras.subcommand_cli_from_dict(verbs, prog=prog, description=description, args=words, config=config)
 
 

@@ -10,11 +10,14 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from acquisition import typed_toml
 from dataset.errors import ToolkitError
 
+Schedule = Literal["cosine", "halving", "flat"]
 PhysicsVariant = Literal["dolp", "stokes", "aolp", "dolp-gain", "none"]
 
 
@@ -94,9 +97,9 @@ class StageConfig:
     """Images a step, shared out among the processes where there are several."""
     learning_rate: float = 1e-3
     """The highest of the schedule."""
-    schedule: Literal["cosine", "halving"] = "cosine"
-    """`cosine` with 8 % warm-up (our choice), or `halving` at every quarter (the paper: every 25 of 100
-    epochs)."""
+    schedule: Schedule = "cosine"
+    """`cosine` with 8 % warm-up (our choice), `halving` at every quarter (the paper: every 25 of 100 epochs),
+    or `flat` for 72 % and then a cosine (Self6D++)."""
     weight_decay: float = 1e-2
     """Of AdamW; 0 is Adam (the paper)."""
     clip_norm: float = 5.0
@@ -168,6 +171,9 @@ class SelfSupervisionConfig(StageConfig):
     physics: PhysicsVariant = "dolp"
     """`dolp` (the paper's L_physics), `none`, or one of our extensions: `stokes` (DoLP and AoLP), `aolp`,
     `dolp-gain` (DoLP, specular reflection diluted by a factor fitted to each image)."""
+    depth: Literal["none", "chamfer", "pixel"] = "none"
+    """A loss on measured depth: the paper's ablation, where it replaces the physics; needs recorded depth."""
+    depth_weight: float = 1.0
     smoothing: int = 3
     """Side of the box over which Stokes values are averaged before L_physics: less noise bias; 1 for thin
     objects."""
@@ -176,6 +182,10 @@ class SelfSupervisionConfig(StageConfig):
     `threshold_quantile`."""
     threshold_quantile: float = 0.08
     """Sets r to this quantile of delta over the training frames (our choice: the paper does not state r)."""
+    teacher: Literal["frozen", "ema"] = "frozen"
+    """`frozen` (the paper), or `ema`: the teacher's weights follow the student's, which must be `large`."""
+    teacher_decay: float = 0.999
+    """Of the moving average that an `ema` teacher is, by step."""
     adapt_batches: int = 25
     """Batches of captured frames on which BatchNorm statistics are re-estimated first (AdaBN); 0: not at
     all."""
@@ -184,14 +194,42 @@ class SelfSupervisionConfig(StageConfig):
 
 
 @dataclass(frozen=True)
+class Self6DConfig(StageConfig):
+    """The RGB-D baseline: self-supervision after Self6D++, with its published weights."""
+
+    steps: int = 400
+    learning_rate: float = 3e-4
+    weight_decay: float = 0.0
+    clip_norm: float = 1.0
+    checkpoint_every: int = 150
+    schedule: Schedule = "flat"
+    pose_weight: float = 10.0
+    mask_weight: float = 1.0
+    chamfer_weight: float = 100.0
+    chamfer_limit_m: float = 0.5
+    """Points further from the other surface than this do not count."""
+    colour_weight: float = 0.2
+    """Of a and b of LAB; grey images have none."""
+    structure_weight: float = 1.0
+    """Of MS-SSIM."""
+    perceptual_weight: float = 0.15
+    """Of LPIPS."""
+    lpips_weights: str = ""
+    """File of LPIPS' weights, see `s2p3.networks.perceptual`; without one the term is left out."""
+
+
+_OptionalName = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(optional)")]
+
+
+@dataclass(frozen=True)
 class FrameSource:
     """Which frames a supervised training sees, and how they reach it."""
 
-    split: str | None = None
+    split: _OptionalName = None
     """Train on this split of the sessions only."""
-    validation: str | None = None
-    """What the weights to keep are chosen on: a session, or a split of the sessions, which is then not
-    trained on. By default a tenth of the frames is kept for it (`holdout`)."""
+    validation: _OptionalName = None
+    """What the weights to keep are chosen on: a session, or a split, which is then not trained on; by
+    default a tenth of the frames (holdout)."""
     storage: Literal["memory", "disk"] = "memory"
     """Whether crops are kept in memory, or made anew from the disk where they do not fit."""
     workers: int = 0
@@ -209,6 +247,7 @@ class ExperimentConfig:
     teacher: PretrainConfig = field(default_factory=PretrainConfig)
     student: PretrainConfig = field(default_factory=PretrainConfig)
     self_supervision: SelfSupervisionConfig = field(default_factory=SelfSupervisionConfig)
+    self6d: Self6DConfig = field(default_factory=Self6DConfig)
 
     def __post_init__(self) -> None:
         sizes = [size for size in (64, 128, 256) if size // self.network.total_stride in (4, 8)]
@@ -255,6 +294,7 @@ def paper() -> ExperimentConfig:
             adapt_batches=0,
             adapt_teacher=False,
         ),
+        self6d=Self6DConfig(epochs=100, batch=6, learning_rate=1e-4),
     )
 
 
@@ -272,6 +312,7 @@ def quick() -> ExperimentConfig:
         teacher=dataclasses.replace(base.teacher, steps=50),
         student=dataclasses.replace(base.student, steps=50),
         self_supervision=dataclasses.replace(base.self_supervision, steps=20, adapt_batches=5),
+        self6d=dataclasses.replace(base.self6d, steps=20),
     )
 
 

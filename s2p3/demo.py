@@ -226,7 +226,8 @@ class Demo:
 
     def train(self) -> None:
         """A process and a thread each: the teacher beside the detector, which the student follows."""
-        common = (str(self.synthetic), "--object", self.model.name, "--preset", self.plan.preset, "--out")
+        words = ("--object", self.model.name, "--preset", self.plan.preset, "--workers", "0", "--out")
+        common = (str(self.synthetic), *words)
 
         def training(checkpoint: Path, steps: int, after: str | None = None) -> Training:
             words = ("train", checkpoint.stem, *common, str(checkpoint.parent))

@@ -26,6 +26,7 @@ def adapt(
     student: Path,
     out: Path,
     settings: SelfSupervisionConfig | None = None,
+    workers: int = 0,
 ) -> Path:
     """Self-supervised training of a student on a split of captured frames; no pose of the session is read.
 
@@ -41,7 +42,7 @@ def adapt(
         indices = frames_of(opened, split)
         detections = find_objects(opened, indices, detector, model.name)
         crops = captured_crops(opened, indices, detections, config.input)
-    return self_supervise(crops, model, teacher, student, out, settings or config.self_supervision)
+    return self_supervise(crops, model, teacher, student, out, settings, workers=workers)
 
 
 def evaluate_split(

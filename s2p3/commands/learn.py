@@ -1,28 +1,20 @@
-"""`s2p3 synthesize` and `s2p3 train ...`: from an object to a pose model."""
+"""`s2p3 synthesize`: from an object to training images."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import tyro
-
 from s2p3.commands.arguments import (
     ObjectName,
     OptionalNumber,
     OptionalPath,
-    RequiredName,
-    RequiredPath,
-    Sessions,
     at_least,
 )
-from s2p3.commands.output import counting, say, show
+from s2p3.commands.output import counting, say
 
 if TYPE_CHECKING:
-    from s2p3.config import ExperimentConfig
     from s2p3.objects import ObjectModel
-
-Preset = Literal["fast", "paper", "quick"]
 
 
 def synthesize(
@@ -111,195 +103,3 @@ def _prepared(name: str, mesh: Path | None, material: Path | None, simplify_mm: 
         f"at most {1000 * fewer.error_m:.3f} mm off"
     )
     return replace(fewer.model, diameter=model.diameter)
-
-
-def train_detector(
-    sessions: Sessions,
-    *,
-    object: ObjectName,
-    out: Path,
-    mesh: OptionalPath = None,
-    preset: Preset = "fast",
-    config: OptionalPath = None,
-    threads: int = 1,
-) -> None:
-    """Train the detector: the object's mask and box in the whole image.
-
-    Args:
-        sessions: files with poses and masks of the object, usually synthetic.
-        object: cup, fork, knife, bottle, or the name of the object in --mesh.
-        out: folder for detector.safetensors and the log; an interrupted training continues.
-        mesh: PLY, OBJ or STL of the object, metres.
-        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
-        config: experiment.toml instead of a preset.
-        threads: CPU threads; one each when two trainings run side by side.
-    """
-    from s2p3.objects import named_object
-    from s2p3.training import train_detector as train
-
-    _use_threads(threads)
-    say(str(train(_some(sessions), named_object(object, mesh), _experiment(preset, config), out)))
-
-
-def train_teacher(
-    sessions: Sessions = [],  # noqa: B006 (tyro tells a list apart, and nothing changes it)
-    *,
-    object: RequiredName = "",
-    out: RequiredPath = Path(),
-    mesh: OptionalPath = None,
-    preset: Preset = "fast",
-    config: OptionalPath = None,
-    threads: int = 1,
-    describe: bool = False,
-    json: bool = False,
-) -> None:
-    """Pre-train the teacher on synthetic sessions.
-
-    Args:
-        sessions: files with poses of the object, usually synthetic.
-        object: cup, fork, knife, bottle, or the name of the object in --mesh.
-        out: folder for teacher.safetensors and the log; an interrupted training continues.
-        mesh: PLY, OBJ or STL of the object, metres.
-        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
-        config: experiment.toml instead of a preset.
-        threads: CPU threads; one each when two trainings run side by side.
-        describe: train nothing; say what the teacher weighs and costs, what it takes and gives.
-        json: with --describe, as JSON.
-    """
-    if describe:
-        _describe("teacher", _experiment(preset, config), json)
-        return
-    _all_given(object=object, out=out)
-    from s2p3.objects import named_object
-    from s2p3.training import train_teacher as train
-
-    _use_threads(threads)
-    say(
-        str(
-            train(
-                _some(sessions),
-                named_object(object, mesh),
-                _experiment(preset, config),
-                out,
-                cache=out.parent,
-            )
-        )
-    )
-
-
-def train_student(
-    sessions: Sessions = [],  # noqa: B006 (tyro tells a list apart, and nothing changes it)
-    *,
-    object: RequiredName = "",
-    out: RequiredPath = Path(),
-    mesh: OptionalPath = None,
-    teacher: OptionalPath = None,
-    preset: Preset = "fast",
-    config: OptionalPath = None,
-    threads: int = 1,
-    describe: bool = False,
-    json: bool = False,
-) -> None:
-    """Pre-train the student on synthetic sessions.
-
-    Args:
-        sessions: files with poses of the object, usually synthetic.
-        object: cup, fork, knife, bottle, or the name of the object in --mesh.
-        out: folder for student.safetensors and the log; an interrupted training continues.
-        mesh: PLY, OBJ or STL of the object, metres.
-        teacher: checkpoint to start the encoders from, where the experiment asks for a warm start.
-        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
-        config: experiment.toml instead of a preset.
-        threads: CPU threads; one each when two trainings run side by side.
-        describe: train nothing; say what the student weighs and costs, what it takes and gives.
-        json: with --describe, as JSON.
-    """
-    if describe:
-        _describe("student", _experiment(preset, config), json)
-        return
-    _all_given(object=object, out=out)
-    from s2p3.objects import named_object
-    from s2p3.training import train_student as train
-
-    _use_threads(threads)
-    model = named_object(object, mesh)
-    say(
-        str(
-            train(_some(sessions), model, _experiment(preset, config), out, cache=out.parent, teacher=teacher)
-        )
-    )
-
-
-def train_self_supervised(
-    session: tyro.conf.Positional[Path],
-    *,
-    object: ObjectName,
-    detector: Path,
-    teacher: Path,
-    student: Path,
-    out: Path,
-    mesh: OptionalPath = None,
-    config: OptionalPath = None,
-    split: str = "train",
-    threads: int = 2,
-) -> None:
-    """Adapt the student to captured frames; no pose of the session is read.
-
-    Args:
-        session: the captured sequence.
-        object: cup, fork, knife, bottle, or the name of the object in --mesh.
-        detector: detector.safetensors.
-        teacher: teacher.safetensors.
-        student: student.safetensors to start from.
-        out: folder for adapted.safetensors and the log; an interrupted training continues.
-        mesh: PLY, OBJ or STL of the object, metres.
-        config: experiment.toml whose [self_supervision] to use instead of the student's.
-        split: name of the split to train on.
-        threads: CPU threads.
-    """
-    from s2p3.config import load
-    from s2p3.learning import adapt
-    from s2p3.objects import named_object
-
-    _use_threads(threads)
-    model = named_object(object, mesh)
-    settings = None if config is None else load(config).self_supervision
-    say(str(adapt(session, split, model, detector, teacher, student, out, settings)))
-
-
-def _some(sessions: list[Path]) -> list[Path]:
-    from dataset.errors import ToolkitError
-
-    if not sessions:
-        raise ToolkitError("no session to train on; name one or more, made with: s2p3 synthesize")
-    return sessions
-
-
-def _describe(kind: Literal["teacher", "student"], experiment: ExperimentConfig, as_json: bool) -> None:
-    from s2p3.networks.describe import describe
-
-    show(describe(kind, experiment), as_json)
-
-
-def _all_given(**values: str | Path) -> None:
-    """Raises ToolkitError: an option that a training needs is missing."""
-    from dataset.errors import ToolkitError
-
-    missing = [f"--{name}" for name, value in values.items() if value in ("", Path())]
-    if missing:
-        raise ToolkitError(
-            f"{' and '.join(missing)} missing; a training needs an object and an output folder"
-        )
-
-
-def _experiment(preset: Preset, config: Path | None) -> ExperimentConfig:
-    from s2p3.config import PRESETS, load
-
-    return PRESETS[preset]() if config is None else load(config)
-
-
-def _use_threads(threads: int) -> None:
-    import torch
-
-    at_least(1, threads=threads)
-    torch.set_num_threads(threads)

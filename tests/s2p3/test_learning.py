@@ -17,6 +17,7 @@ from s2p3.cli import main
 from s2p3.evaluation import Evaluation
 from s2p3.learning import adapt, frames_of
 from s2p3.objects import build
+from s2p3.training.checkpoint import read_info
 
 COUNT = 4
 
@@ -49,7 +50,17 @@ def networks(tmp_path_factory: pytest.TempPathFactory, synthetic: Path, experime
     """Folder with detector, teacher and student."""
     out = tmp_path_factory.mktemp("networks")
     for verb in ("detector", "teacher", "student"):
-        words = [str(synthetic), "--object", "cup", "--config", str(experiment), "--out", str(out / verb)]
+        words = [
+            str(synthetic),
+            "--object",
+            "cup",
+            "--config",
+            str(experiment),
+            "--out",
+            str(out / verb),
+            "--workers",
+            "0",
+        ]
         assert main(["train", verb, *words]) == 0
     return out
 
@@ -121,8 +132,9 @@ def test_self_supervision_adapts_the_student(networks: Path, synthetic: Path, ex
     ]
     for name in ("detector", "teacher", "student"):
         words += [f"--{name}", str(checkpoint(networks, name))]
-    assert main(["train", "self-supervised", *words, "--threads", "1"]) == 0
+    assert main(["train", "self-supervised", *words, "--workers", "0"]) == 0
     assert checkpoint(networks, "adapted").exists()
+    assert read_info(checkpoint(networks, "adapted")).step == 2
     assert checkpoint(networks, "adapted").read_bytes() != checkpoint(networks, "student").read_bytes()
 
 

@@ -1,0 +1,123 @@
+"""The experiment on the command line: a preset or a file, any field of which an option overrides.
+
+Every training verb has a parameter `experiment`, the parts of the experiment it depends on. Its options are
+made from the fields of these dataclasses, `--config.teacher.steps` and the like; their defaults are those of
+the preset, file or checkpoint that the other words of the command name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import inspect
+import json
+import typing
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+
+from acquisition import typed_toml
+from s2p3.config import (
+    PRESETS,
+    AugmentationConfig,
+    DetectorConfig,
+    ExperimentConfig,
+    InputConfig,
+    NetworkConfig,
+    PretrainConfig,
+    SelfSupervisionConfig,
+    load,
+)
+
+Preset = Literal["fast", "paper", "quick"]
+
+_FAST = PRESETS["fast"]()
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some tables of an experiment."""
+
+    def within(self, base: ExperimentConfig) -> ExperimentConfig:
+        """`base` with these tables instead of its own. Raises ToolkitError: values that do not fit."""
+        return replace(base, **{field.name: getattr(self, field.name) for field in fields(self)})
+
+
+@dataclass(frozen=True)
+class DetectorPart(Part):
+    detector: DetectorConfig = _FAST.detector
+
+
+@dataclass(frozen=True)
+class TeacherPart(Part):
+    input: InputConfig = _FAST.input
+    augmentation: AugmentationConfig = _FAST.augmentation
+    network: NetworkConfig = _FAST.network
+    teacher: PretrainConfig = _FAST.teacher
+
+
+@dataclass(frozen=True)
+class StudentPart(Part):
+    input: InputConfig = _FAST.input
+    augmentation: AugmentationConfig = _FAST.augmentation
+    network: NetworkConfig = _FAST.network
+    student: PretrainConfig = _FAST.student
+
+
+@dataclass(frozen=True)
+class SelfSupervisionPart(Part):
+    self_supervision: SelfSupervisionConfig = _FAST.self_supervision
+
+
+_UNDER_CONFIG: Any = tyro.conf.arg(name="config")
+DetectorFields = Annotated[DetectorPart, _UNDER_CONFIG]
+TeacherFields = Annotated[TeacherPart, _UNDER_CONFIG]
+StudentFields = Annotated[StudentPart, _UNDER_CONFIG]
+SelfSupervisionFields = Annotated[SelfSupervisionPart, _UNDER_CONFIG]
+
+
+def experiment_of(preset: Preset = "fast", config: Path | None = None) -> ExperimentConfig:
+    """The preset, or the file where one is given. Raises ToolkitError as `config.load`."""
+    return PRESETS[preset]() if config is None else load(config)
+
+
+Verb = TypeVar("Verb", bound=Callable[..., Any])
+
+
+def with_defaults(verb: Verb, words: Sequence[str]) -> Verb:
+    """A verb whose `experiment` has the values of the preset, file or checkpoint named in the words after it;
+    other verbs as they are.
+
+    Raises ToolkitError: the file cannot be read.
+    """
+    parameter = inspect.signature(verb).parameters.get("experiment")
+    if parameter is None:
+        return verb
+    base, part = named_in(words), type(parameter.default)
+    values = {field.name: getattr(base, field.name) for field in fields(part)}
+    return typing.cast(Verb, functools.partial(verb, experiment=part(**values)))
+
+
+def named_in(words: Sequence[str]) -> ExperimentConfig:
+    """The experiment that --config, --preset or --student name; where they are wrong, the verb says so."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    for name in ("--preset", "--config", "--student"):
+        parser.add_argument(name, nargs="?")
+    found, _ = parser.parse_known_args(list(words))
+    if found.config is not None:
+        return load(found.config)
+    if found.student is not None:
+        return _of_checkpoint(Path(found.student))
+    return PRESETS.get(found.preset or "fast", PRESETS["fast"])()
+
+
+def _of_checkpoint(path: Path) -> ExperimentConfig:
+    """What a network was trained with; read without torch."""
+    try:
+        text = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["config"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return PRESETS["fast"]()
+    return typed_toml.loads(ExperimentConfig, text, source=str(path))

@@ -1,0 +1,225 @@
+"""`s2p3 train ...`: the networks, on synthetic sessions first, then on captured ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from s2p3.commands.arguments import (
+    ObjectName,
+    OptionalPath,
+    RequiredName,
+    RequiredPath,
+    Sessions,
+    at_least,
+)
+from s2p3.commands.experiment import (
+    DetectorFields,
+    DetectorPart,
+    Preset,
+    SelfSupervisionFields,
+    SelfSupervisionPart,
+    StudentFields,
+    StudentPart,
+    TeacherFields,
+    TeacherPart,
+    experiment_of,
+)
+from s2p3.commands.output import say, show
+from s2p3.config import FrameSource
+
+if TYPE_CHECKING:
+    from s2p3.config import ExperimentConfig
+
+Frames = Annotated[FrameSource, tyro.conf.arg(name="")]
+_FRAMES = FrameSource(workers=1)
+_DETECTOR, _TEACHER, _STUDENT = DetectorPart(), TeacherPart(), StudentPart()
+_SELF_SUPERVISION = SelfSupervisionPart()
+
+
+def train_detector(
+    sessions: Sessions,
+    *,
+    object: ObjectName,
+    out: Path,
+    mesh: OptionalPath = None,
+    preset: Preset = "fast",
+    config: OptionalPath = None,
+    threads: int = 1,
+    workers: int = 1,
+    experiment: DetectorFields = _DETECTOR,
+) -> None:
+    """Train the detector: the object's mask and box in the whole image.
+
+    Args:
+        sessions: files with poses and masks of the object, usually synthetic.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
+        out: folder for detector.safetensors and the log; an interrupted training continues.
+        mesh: PLY, OBJ or STL of the object, metres.
+        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
+        config: experiment.toml instead of a preset.
+        threads: CPU threads of the network.
+        workers: processes that augment, a thread each; 0: the training does it itself.
+    """
+    from s2p3.objects import named_object
+    from s2p3.training import train_detector as train
+
+    _use(threads, workers)
+    chosen = experiment.within(experiment_of(preset, config))
+    say(str(train(_some(sessions), named_object(object, mesh), chosen, out, workers=workers)))
+
+
+def train_teacher(
+    sessions: Sessions = [],  # noqa: B006 (tyro tells a list apart, and nothing changes it)
+    *,
+    object: RequiredName = "",
+    out: RequiredPath = Path(),
+    mesh: OptionalPath = None,
+    preset: Preset = "fast",
+    config: OptionalPath = None,
+    threads: int = 1,
+    frames: Frames = _FRAMES,
+    describe: bool = False,
+    json: bool = False,
+    experiment: TeacherFields = _TEACHER,
+) -> None:
+    """Pre-train the teacher, on synthetic sessions or on annotated ones.
+
+    Args:
+        sessions: files with poses of the object, usually synthetic.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
+        out: folder for teacher.safetensors and the log; an interrupted training continues.
+        mesh: PLY, OBJ or STL of the object, metres.
+        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
+        config: experiment.toml instead of a preset.
+        threads: CPU threads of the network.
+        describe: train nothing; say what the teacher weighs and costs, what it takes and gives.
+        json: with --describe, as JSON.
+    """
+    chosen = experiment.within(experiment_of(preset, config))
+    if describe:
+        _describe("teacher", chosen, json)
+        return
+    _all_given(object=object, out=out)
+    from s2p3.objects import named_object
+    from s2p3.training import train_teacher as train
+
+    _use(threads, frames.workers)
+    model = named_object(object, mesh)
+    say(str(train(_some(sessions), model, chosen, out, cache=out.parent, frames=frames)))
+
+
+def train_student(
+    sessions: Sessions = [],  # noqa: B006 (tyro tells a list apart, and nothing changes it)
+    *,
+    object: RequiredName = "",
+    out: RequiredPath = Path(),
+    mesh: OptionalPath = None,
+    teacher: OptionalPath = None,
+    preset: Preset = "fast",
+    config: OptionalPath = None,
+    threads: int = 1,
+    frames: Frames = _FRAMES,
+    describe: bool = False,
+    json: bool = False,
+    experiment: StudentFields = _STUDENT,
+) -> None:
+    """Pre-train the student, on synthetic sessions or on annotated ones.
+
+    Args:
+        sessions: files with poses of the object, usually synthetic.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
+        out: folder for student.safetensors and the log; an interrupted training continues.
+        mesh: PLY, OBJ or STL of the object, metres.
+        teacher: checkpoint to start the encoders from, where the experiment asks for a warm start.
+        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
+        config: experiment.toml instead of a preset.
+        threads: CPU threads of the network.
+        describe: train nothing; say what the student weighs and costs, what it takes and gives.
+        json: with --describe, as JSON.
+    """
+    chosen = experiment.within(experiment_of(preset, config))
+    if describe:
+        _describe("student", chosen, json)
+        return
+    _all_given(object=object, out=out)
+    from s2p3.objects import named_object
+    from s2p3.training import train_student as train
+
+    _use(threads, frames.workers)
+    model = named_object(object, mesh)
+    say(str(train(_some(sessions), model, chosen, out, cache=out.parent, teacher=teacher, frames=frames)))
+
+
+def train_self_supervised(
+    session: tyro.conf.Positional[Path],
+    *,
+    object: ObjectName,
+    detector: Path,
+    teacher: Path,
+    student: Path,
+    out: Path,
+    mesh: OptionalPath = None,
+    config: OptionalPath = None,
+    split: str = "train",
+    threads: int = 1,
+    workers: int = 1,
+    experiment: SelfSupervisionFields = _SELF_SUPERVISION,
+) -> None:
+    """Adapt the student to captured frames; no pose of the session is read.
+
+    Args:
+        session: the captured sequence.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
+        detector: detector.safetensors.
+        teacher: teacher.safetensors.
+        student: student.safetensors to start from.
+        out: folder for adapted.safetensors and the log; an interrupted training continues.
+        mesh: PLY, OBJ or STL of the object, metres.
+        config: experiment.toml whose [self_supervision] to use instead of the student's.
+        split: name of the split to train on.
+        threads: CPU threads of the network.
+        workers: processes that augment, a thread each; 0: the training does it itself.
+    """
+    del config  # with_defaults has read it
+    from s2p3.learning import adapt
+    from s2p3.objects import named_object
+
+    _use(threads, workers)
+    model, settings = named_object(object, mesh), experiment.self_supervision
+    say(str(adapt(session, split, model, detector, teacher, student, out, settings, workers)))
+
+
+def _some(sessions: list[Path]) -> list[Path]:
+    from dataset.errors import ToolkitError
+
+    if not sessions:
+        raise ToolkitError("no session to train on; name one or more, made with: s2p3 synthesize")
+    return sessions
+
+
+def _describe(kind: Literal["teacher", "student"], experiment: ExperimentConfig, as_json: bool) -> None:
+    from s2p3.networks.describe import describe
+
+    show(describe(kind, experiment), as_json)
+
+
+def _all_given(**values: str | Path) -> None:
+    """Raises ToolkitError: an option that a training needs is missing."""
+    from dataset.errors import ToolkitError
+
+    missing = [f"--{name}" for name, value in values.items() if value in ("", Path())]
+    if missing:
+        raise ToolkitError(
+            f"{' and '.join(missing)} missing; a training needs an object and an output folder"
+        )
+
+
+def _use(threads: int, workers: int) -> None:
+    import torch
+
+    at_least(1, threads=threads)
+    at_least(0, workers=workers)
+    torch.set_num_threads(threads)

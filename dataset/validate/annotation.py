@@ -115,10 +115,11 @@ def _check_rigid(view: View, path: str) -> Iterator[Problem]:
         yield Problem(path, f"is only partly known at frame {first_frames(partial)}", _ANNOTATE)
     safe = np.where(finite[:, None, None], matrices, np.eye(4))
     rotation = safe[:, :3, :3]
-    error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
-    wrong = (error > _ORTHONORMAL) | (np.linalg.det(rotation) < 0)
+    with np.errstate(over="ignore", invalid="ignore"):  # a damaged number may be of any size
+        error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
+        wrong = ~((error <= _ORTHONORMAL) & (np.linalg.det(rotation) > 0))
     if wrong.any():
-        what = f"holds no rotation at frame {first_frames(wrong)} (off by {error.max():.2g})"
+        what = f"holds no rotation at frame {first_frames(wrong)} (off by {error[wrong].max():.2g})"
         yield Problem(path, what, _ANNOTATE)
     wrong = np.abs(safe[:, 3] - [0, 0, 0, 1]).max(axis=1, initial=0) > _ORTHONORMAL
     if wrong.any():

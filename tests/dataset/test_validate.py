@@ -164,6 +164,11 @@ DAMAGES: dict[str, tuple[Callable[[h5py.File], None], str, str]] = {
         "poses/T_base_cam",
         "no rotation at frame 5",
     ),
+    "huge rotation": (
+        lambda f: spoil(f, "poses/T_base_cam", (5, slice(0, 2)), [[1e200, 1e200, -1e200, 0]] * 2),
+        "poses/T_base_cam",
+        "no rotation at frame 5",
+    ),
     "partly known pose": (
         lambda f: spoil(f, "poses/objects/tetra/T_cam_obj", (5, 0, 3), np.nan),
         "poses/objects/tetra/T_cam_obj",

@@ -1,8 +1,8 @@
 """How long opening and summarising a session takes, short and long: `python tools/bench/session_open.py
 [--json]`.
 
-The sessions hold 500 and 50,000 frames of 8x8 pixels, written by the recorder's own writer in one process.
-The peer is plain h5py opening the same file and reading the length of its frames.
+The sessions hold 500 and 50,000 copies of one frame of 8x8 pixels. The peer is plain h5py opening the same
+file and reading the length of its frames.
 """
 
 from __future__ import annotations

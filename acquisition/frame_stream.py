@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from acquisition.camera import Camera
+from acquisition.camera import Camera, CameraLost
 from dataset.errors import DeviceError, ToolkitError
 from dataset.frames import RawFrame
 from dataset.session import Chunk, SessionWriter, compress
@@ -227,9 +227,14 @@ class FrameStream:
     def _next_frame(self) -> RawFrame:
         try:
             return self._camera.read()
-        except DeviceError:
+        except DeviceError as error:
             # A host that stood still for longer than the time-out finds the frames waiting in the driver.
-            return self._camera.read(_SECOND_LOOK_S)
+            try:
+                return self._camera.read(_SECOND_LOOK_S)
+            except CameraLost:
+                raise
+            except DeviceError:
+                raise error from None
 
     def _write(self) -> None:
         try:

@@ -152,6 +152,11 @@ class AravisCamera(QueuedCamera):
                 ": not one packet of the stream arrived; check that the firewall lets UDP through, that the "
                 "MTU (ip link) is at least packet_size, and that a trigger came if it waits for one"
             )
+        if self._trigger == "free":
+            return (
+                ": its stream stopped although it answers; check the cable, the switch and the firewall, and "
+                "that timeout_s is longer than the exposure"
+            )
         return "; lengthen timeout_s, or trigger it once for each read"
 
     @contextlib.contextmanager

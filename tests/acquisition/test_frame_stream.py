@@ -12,7 +12,7 @@ import pytest
 from acquisition.camera import CameraConfig
 from acquisition.cameras.aravis import AravisCamera
 from acquisition.frame_stream import NOT_RECEIVED, QUEUE_FULL, FrameLedger, FrameStream
-from acquisition.recorder import record_stream
+from acquisition.recorder import Progress, record_stream
 from acquisition.simulation.camera import SimulatedCamera
 from dataset.errors import DeviceError
 from dataset.frames import RawFrame
@@ -43,6 +43,28 @@ def test_incomplete_frames_are_ledgered(
         lost = session.drops[session.drops["reason"] == NOT_RECEIVED.encode()]
         assert 0 < len(lost) <= statistics.incomplete + statistics.discarded + statistics.underruns
         assert (lost["host_time_ns"] > session.host_time_ns[0]).all()
+
+
+def test_a_stream_that_stops_is_told_as_such_and_ends_the_recording(
+    tmp_path: Path, simulated_camera: SimulatedCamera, camera: AravisCamera
+) -> None:
+    def stop_it(progress: Progress) -> None:
+        if progress.frames > 20:
+            simulated_camera.set_lost_ratio(1.0)
+
+    try:
+        with (
+            pytest.raises(
+                DeviceError, match="within 2 s: its stream stopped although it answers; check the ca"
+            ),
+            SessionWriter(tmp_path / "s.h5", "sequence", camera.info) as writer,
+        ):
+            record_stream(camera, None, writer, duration_s=60.0, on_progress=stop_it)
+    finally:
+        simulated_camera.set_lost_ratio(0.0)
+    with Session.open(tmp_path / "s.h5") as session:
+        assert len(session) > 20
+        assert not session.complete
 
 
 class SlowDisk(SessionWriter):

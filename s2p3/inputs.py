@@ -96,6 +96,16 @@ def extract_crop(image: NDArray[np.float32], box_xywh: ArrayLike, size: int) -> 
     return np.ascontiguousarray(np.moveaxis(crop.reshape(size, size, -1), -1, 0))
 
 
+def extract_depth(depth: NDArray[np.float32], box_xywh: ArrayLike, size: int) -> NDArray[np.float32]:
+    """The same cut out of a depth image (H, W), on the same grid: the nearest pixel's value, because between
+    surfaces there is none; 0, which is unknown, outside."""
+    x, y, w, h = np.asarray(box_xywh, dtype=np.float64)
+    matrix = np.array([[w / size, 0, x + 0.5 * w / size - 0.5], [0, h / size, y + 0.5 * h / size - 0.5]])
+    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    crop = cv2.warpAffine(np.ascontiguousarray(depth), matrix, (size, size), flags=flags)
+    return crop.astype(np.float32, copy=False)
+
+
 def crop_intrinsics(intrinsics: Intrinsics, box_xywh: ArrayLike, size: int) -> NDArray[np.float32]:
     """(3, 3) pinhole matrix of `extract_crop`'s result."""
     return intrinsics.crop(box_xywh, size).K.astype(np.float32)

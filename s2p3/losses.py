@@ -16,6 +16,9 @@ from torch import Tensor
 from s2p3 import physics
 from s2p3.config import PhysicsVariant
 
+CLOUD_POINTS = 256
+"""Points a depth map is thinned out to before clouds are compared (our choice)."""
+
 _FLOOR = 1e-3  # of S0
 _GAIN = (0.3, 1.0)  # range of the fitted dilution: below it a wrong pose could silence the loss
 

@@ -137,7 +137,8 @@ def evaluate(
             index = int(indices[position])
             stokes = session.stokes(index).stack()
             detection = find(stokes) if detections is None else detections[position]
-            found = None if detection is None else estimate(stokes, detection, camera)
+            depth = session.depth(index) if session.has_depth else None
+            found = None if detection is None else estimate(stokes, detection, camera, depth)
             true = poses.T_cam_obj[index]
             sight = ruler.sight(index, float(poses.visible_fraction[index]), true)
             if found is None:

@@ -91,16 +91,28 @@ class Estimator:
 
     @torch.no_grad()
     def __call__(
-        self, stokes: NDArray[np.float32], detection: Detection, intrinsics: Intrinsics
+        self,
+        stokes: NDArray[np.float32],
+        detection: Detection,
+        intrinsics: Intrinsics,
+        depth: NDArray[np.float32] | None = None,
     ) -> PoseEstimate:
         """Estimates the pose of what was detected.
 
         Args:
             stokes: (3, H, W), undistorted.
             intrinsics: of that image, a pinhole.
+            depth: (H, W) metres, 0 unknown, where there is one.
+
+        Raises ToolkitError: a network that sees depth, and there is none.
         """
         config: ExperimentConfig = self.info.config
-        crop = single_crop(stokes, detection, intrinsics, config.input)
+        if config.input.modality == "rgbd" and depth is None:
+            raise ToolkitError(
+                "this network sees depth, and the images come without; give a session with depth, or a "
+                "network of another input.modality"
+            )
+        crop = single_crop(stokes, detection, intrinsics, config.input, depth)
         view = View.centred(1, config.input.zoom)
         seen = form_input(crop, torch.tensor([0]), view, self.info.refractive_index, config)
         pose = pose_of(self.network(seen.polarization, seen.priors))

@@ -64,7 +64,7 @@ def predictions(shots: Iterable[Shot], find: Finder, estimate: Estimator) -> Ite
     for shot in shots:
         started = time.perf_counter()
         detection = find(shot.stokes)
-        found = None if detection is None else estimate(shot.stokes, detection, shot.intrinsics)
+        found = None if detection is None else estimate(shot.stokes, detection, shot.intrinsics, shot.depth)
         yield Prediction(shot, found, time.perf_counter() - started)
 
 

@@ -34,6 +34,7 @@ class Shot:
         intrinsics: of that image, a pinhole.
         T_base_cam: the camera in the robot's base frame; None where unknown.
         host_time_ns: when it arrived; 0 where unknown.
+        depth: (H, W) metres, 0 unknown; None where there is none.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Shot:
     intrinsics: Intrinsics
     T_base_cam: SE3 | None
     host_time_ns: int
+    depth: NDArray[np.float32] | None = None
 
 
 def session_shots(session: Session, indices: Sequence[int]) -> Iterator[Shot]:
@@ -50,7 +52,8 @@ def session_shots(session: Session, indices: Sequence[int]) -> Iterator[Shot]:
         known = poses is not None and bool(poses.finite[index])
         place = poses[index] if poses is not None and known else None
         stokes = session.stokes(index).stack()
-        yield Shot(str(index), stokes, session.working_intrinsics, place, int(times[index]))
+        depth = session.depth(index) if session.has_depth else None
+        yield Shot(str(index), stokes, session.working_intrinsics, place, int(times[index]), depth)
 
 
 def folder_shots(folder: Path, mosaic: Mosaic, bits: int | None, calibration: Calibration) -> Iterator[Shot]:

@@ -64,7 +64,10 @@ def form_input(
     if config.input.background == "mask":
         mask = window.resample(crops.mask[indices].float(), padding="zeros")
         mask = _degrade(mask, augment) if degrade_mask and augment is not None else (mask > 0.5).float()
-    return inputs.network_input(stokes, window.K, refractive_index, config.input, mask)
+    depth = None
+    if crops.depth is not None:
+        depth = window.resample(crops.depth[indices].float(), mode="nearest", padding="zeros")
+    return inputs.network_input(stokes, window.K, refractive_index, config.input, mask, depth)
 
 
 def form_targets(crops: LabelledCrops, indices: Tensor, view: View, config: ExperimentConfig) -> Targets:

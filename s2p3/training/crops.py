@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +24,7 @@ from dataset import SE3, Intrinsics
 from dataset.errors import ToolkitError
 from dataset.session import Session, mask_box
 from s2p3.config import InputConfig
-from s2p3.inputs import crop_intrinsics, extract_crop, square_box
+from s2p3.inputs import crop_intrinsics, extract_crop, extract_depth, square_box
 from s2p3.networks.detector import Detection
 from s2p3.objects import ObjectModel, Symmetry
 from s2p3.rendering import rasterize
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _MINIMUM_VISIBLE = 0.3  # our choice: frames that show less of the object than this are not trained on
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Crops:
     """N upright canonical crops of side P.
 
@@ -46,22 +46,28 @@ class Crops:
         mask: (N, 1, P, P) float16, 0 to 1: predicted, or the visible mask where the truth is known.
         K: (N, 3, 3) float32, intrinsics of the crops.
         frames: (N,) int64, frame index in the session (or position in the list of sessions' frames).
+        depth: (N, 1, P, P) float16 metres, 0 unknown; None where the sessions have none.
     """
 
     stokes: Tensor
     mask: Tensor
     K: Tensor
     frames: Tensor
+    depth: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.stokes)
 
     def take(self, rows: Tensor) -> Self:
         """Some of the crops."""
-        return type(self)(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+        return type(self)(**{name: tensor[rows] for name, tensor in self.tensors().items()})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All there are, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LabelledCrops(Crops):
     """Crops with their truth.
 
@@ -85,11 +91,21 @@ def content_hashes(paths: Sequence[Path], model: ObjectModel) -> dict[str, str]:
     for path in paths:
         with Session.open(path) as session:
             digest = hashlib.sha256(session.contents.read("camera/crc32", slice(len(session))).tobytes())
+            if session.has_depth:
+                digest.update(session.contents.read("depth_crc32", slice(len(session))).tobytes())
             camera, poses = session.working_intrinsics, session.object_poses(model.name)
             for part in (camera.K, camera.distortion, poses.T_cam_obj.as_matrix(), poses.bbox_xywh):
                 digest.update(np.ascontiguousarray(part).tobytes())
             hashes[session.session_id] = digest.hexdigest()[:16]
     return hashes
+
+
+def crops_hash(crops: Crops) -> str:
+    """A short hash of what captured crops show."""
+    digest = hashlib.sha256()
+    for tensor in crops.tensors().values():
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def fingerprint(paths: Sequence[Path], model: ObjectModel, config: InputConfig) -> str:
@@ -126,14 +142,21 @@ def labelled_crops(
                     stokes = np.moveaxis(session.stokes(index).stack(), 0, -1)
                     mask, pose = poses.mask(index), poses.T_cam_obj[index]
                     crop = labelled_crop(
-                        stokes, mask, pose, session.working_intrinsics, model, config, len(rows)
+                        stokes,
+                        mask,
+                        pose,
+                        session.working_intrinsics,
+                        model,
+                        config,
+                        len(rows),
+                        depth_of(session, index, config),
                     )
                     rows.append(crop)
                     report(len(rows), len(shown), {})
     crops = collate(rows)
     if stored is not None:
         stored.parent.mkdir(parents=True, exist_ok=True)
-        save_tensors(stored, vars(crops))
+        save_tensors(stored, crops.tensors())
     return crops
 
 
@@ -164,6 +187,7 @@ def labelled_crop(
     model: ObjectModel,
     config: InputConfig,
     frame: int,
+    depth: NDArray[np.float32] | None = None,
 ) -> dict[str, NDArray[np.generic]]:
     """One row of `LabelledCrops`.
 
@@ -171,16 +195,21 @@ def labelled_crop(
         stokes: (H, W, 3) undistorted, or a memory map of it: only the part under the crop is read.
         mask: (H, W), visible, not empty.
         frame: what the row's `frames` says.
+        depth: (H, W) metres, where there is one.
     """
-    crop = _crop(stokes, mask, mask_box(mask), intrinsics, config, frame)
+    crop = _crop(stokes, mask, mask_box(mask), intrinsics, config, frame, depth)
     return crop | _truth(crop["K"], mask, T_cam_obj, intrinsics, model, config)
 
 
 def collate(rows: Sequence[dict[str, NDArray[np.generic]]]) -> LabelledCrops:
     """Rows of `labelled_crop` as one batch."""
-    return LabelledCrops(
-        **{name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
-    )
+    return LabelledCrops(**_stacked(rows))
+
+
+def _stacked(rows: Sequence[dict[str, NDArray[np.generic]]]) -> dict[str, Tensor]:
+    """What all rows have (some sessions may lack depth), by name."""
+    names = [name for name in rows[0] if all(name in row for row in rows)]
+    return {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in names}
 
 
 def captured_crops(
@@ -188,9 +217,9 @@ def captured_crops(
 ) -> Crops:
     """The crops of captured frames at their predicted boxes; frames without a detection are left out.
 
-    Reads the Stokes images and the intrinsics of `session`, nothing else.
+    Reads the Stokes and depth images and the intrinsics of `session`, nothing else.
 
-    Raises ToolkitError: the object was detected in no frame.
+    Raises ToolkitError: the object was detected in no frame; networks that see depth, and there is none.
     """
     rows = [
         _crop(
@@ -200,6 +229,7 @@ def captured_crops(
             session.working_intrinsics,
             config,
             index,
+            depth_of(session, index, config),
         )
         for index, found in zip(indices, detections, strict=True)
         if found is not None
@@ -209,15 +239,34 @@ def captured_crops(
             "the detector found the object in none of the frames given; "
             "train it longer, or on scenes closer to these"
         )
-    return Crops(**{name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]})
+    return Crops(**_stacked(rows))
+
+
+def depth_of(session: Session, index: int, config: InputConfig) -> NDArray[np.float32] | None:
+    """The depth image of a frame, None where the session has none.
+
+    Raises ToolkitError: networks that see depth, and there is none.
+    """
+    if session.has_depth:
+        return session.depth(index)
+    if config.modality == "rgbd":
+        raise ToolkitError(
+            f"{session.path} has no depth, and these networks see it; record it, synthesize with --depth, or "
+            "take networks without"
+        )
+    return None
 
 
 def single_crop(
-    stokes: NDArray[np.float32], found: Detection, intrinsics: Intrinsics, config: InputConfig
+    stokes: NDArray[np.float32],
+    found: Detection,
+    intrinsics: Intrinsics,
+    config: InputConfig,
+    depth: NDArray[np.float32] | None = None,
 ) -> Crops:
     """The crop (N = 1) of one undistorted Stokes image (3, H, W) at a predicted box."""
-    row = _crop(np.moveaxis(stokes, 0, -1), found.mask, found.box_xywh, intrinsics, config, 0)
-    return Crops(**{name: torch.from_numpy(value[None]) for name, value in row.items()})
+    row = _crop(np.moveaxis(stokes, 0, -1), found.mask, found.box_xywh, intrinsics, config, 0, depth)
+    return Crops(**_stacked([row]))
 
 
 def canonical_pose(pose: SE3, symmetry: Symmetry) -> SE3:
@@ -240,13 +289,19 @@ def _crop(
     intrinsics: Intrinsics,
     config: InputConfig,
     frame: int,
+    depth: NDArray[np.float32] | None,
 ) -> dict[str, NDArray[np.generic]]:
     region = square_box(box, config.canonical_zoom)
     rows, columns = _under(region, mask.shape)
     part = np.dstack([stokes[rows, columns], mask[rows, columns]]).astype(np.float32)
     local = region - [columns.start, rows.start, 0, 0]
     crop = extract_crop(np.moveaxis(part, -1, 0), local, config.canonical_size).astype(np.float16)
+    measured = {}
+    if depth is not None:
+        near = extract_depth(depth[rows, columns], local, config.canonical_size)
+        measured["depth"] = near[None].astype(np.float16)
     return {
+        **measured,
         "stokes": crop[:3],
         "mask": crop[3:],
         "K": crop_intrinsics(intrinsics, region, config.canonical_size),

@@ -27,7 +27,7 @@ from dataset.session import Session
 from dataset.stokes_cache import cached_stokes
 from s2p3.config import InputConfig
 from s2p3.objects import ObjectModel
-from s2p3.training.crops import LabelledCrops, collate, labelled_crop, shown_rows
+from s2p3.training.crops import LabelledCrops, collate, depth_of, labelled_crop, shown_rows
 
 Row = dict[str, NDArray[np.generic]]
 
@@ -78,6 +78,7 @@ class CropDataset(Dataset[Row]):
             self.model,
             self.config,
             row,
+            depth_of(session, index, self.config),
         )
 
     def take(self, rows: Tensor) -> LabelledCrops:

@@ -15,13 +15,13 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
-from s2p3.config import StageConfig
+from s2p3.config import Schedule, StageConfig
 from s2p3.training.checkpoint import save_tensors
 from s2p3.training.loader import Data, Steps, stream
 from s2p3.training.log import RunLog
@@ -35,6 +35,7 @@ Forward = Callable[..., Any]
 Network = TypeVar("Network", bound=nn.Module)
 
 _WARM_UP = 0.08
+_FLAT = 0.72
 _LOG_EVERY = 10
 
 
@@ -166,10 +167,12 @@ def optimize(
     return Trained(average, steps) if best is None else Trained(average, best.step, best.score)
 
 
-def rate_factor(schedule: Literal["cosine", "halving"], progress: float) -> float:
+def rate_factor(schedule: Schedule, progress: float) -> float:
     """Learning rate relative to its highest, at `progress` from 0 to 1."""
     if schedule == "halving":
         return 0.5 ** int(progress * 4)
+    if schedule == "flat":
+        return 0.5 * (1 + math.cos(math.pi * max(progress - _FLAT, 0) / (1 - _FLAT)))
     if progress < _WARM_UP:
         return (progress + 1e-3) / (_WARM_UP + 1e-3)
     return 0.5 * (1 + math.cos(math.pi * (progress - _WARM_UP) / (1 - _WARM_UP)))

@@ -30,6 +30,7 @@ from s2p3.training.examples import CropSource, Examples
 from s2p3.training.loop import Forward, Losses, Objective, Score, optimize
 from s2p3.training.progress import OnStep
 from s2p3.training.scoring import PoseScorer
+from s2p3.training.signal import labelled_signal, report_signal
 
 ALL_FRAMES = FrameSource()
 MODEL_POINTS = 300
@@ -59,7 +60,7 @@ def train_teacher(
     examples = Examples.of(sessions, model, config.input, settings, frames, cache)
     torch.manual_seed(settings.seed)
     network = build_teacher(config, imagenet=True)
-    objective = TeacherObjective(*model_tensors(model), model.diameter, settings.dense_weight)
+    objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
     run = Pretraining("teacher", model, config, settings, examples, content_hashes(sessions, model))
     return run.train(network, objective, out, frames.workers, on_step)
 
@@ -93,7 +94,7 @@ def train_student(
                 "student.warm_start needs the teacher's checkpoint; give it, or set warm_start = false"
             )
         network.encoder.load_state_dict(load_teacher(teacher, model.name)[0].encoder.state_dict())
-    objective = PoseObjective(*model_tensors(model), model.diameter)
+    objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
     run = Pretraining("student", model, config, settings, examples, content_hashes(sessions, model))
     return run.train(network, objective, out, frames.workers, on_step)
 
@@ -119,6 +120,7 @@ class Pretraining:
     ) -> Path:
         """Optimizes `network` and writes `out`/KIND.safetensors, which is returned."""
         path, examples, index = out / f"{self.kind}.safetensors", self.examples, self.model.refractive_index
+        report_signal(labelled_signal(examples.source, examples.rows, self.model), path)
         data = LabelledData(examples.source, examples.rows, index, self.config)
         score = None
         if examples.held_out is not None:
@@ -202,41 +204,29 @@ class LabelledData:
 
 
 @dataclass(frozen=True)
-class PoseObjective:
-    """Supervision by poses alone: the paper's.
+class SupervisedObjective:
+    """Supervision by poses (the paper's), and of a network with a decoder by its maps, too (our choice).
 
     Attributes:
         points: (P, 3) of the object, metres.
         symmetries: (M, 4, 4) motions that leave it unchanged.
         diameter_m: of the object.
+        dense_weight: of the maps' losses; 0 leaves them out.
     """
 
     points: Tensor
     symmetries: Tensor
     diameter_m: float
-
-    def __call__(self, forward: Forward, batch: LabelledBatch) -> Losses:
-        return self.of(pose_of(forward(batch.seen.polarization, batch.seen.priors)), batch)
-
-    def of(self, output: Tensor, batch: LabelledBatch) -> Losses:
-        """The losses of a head's output."""
-        seen = batch.seen
-        return pose_terms(
-            output, seen.K, batch.targets, seen.size, self.diameter_m, self.points, self.symmetries
-        )
-
-
-@dataclass(frozen=True)
-class TeacherObjective(PoseObjective):
-    """The same, and with a `dense_weight` above zero the teacher's maps, too (our choice)."""
-
     dense_weight: float
 
     def __call__(self, forward: Forward, batch: LabelledBatch) -> Losses:
-        output: TeacherOutput = forward(batch.seen.polarization, batch.seen.priors)
-        terms = self.of(output.pose, batch)
-        if self.dense_weight > 0:
-            maps, truth = (output.mask_logits, output.normals, output.coordinates), batch.targets
+        seen, truth = batch.seen, batch.targets
+        output: Tensor | TeacherOutput = forward(seen.polarization, seen.priors)
+        terms = pose_terms(
+            pose_of(output), seen.K, truth, seen.size, self.diameter_m, self.points, self.symmetries
+        )
+        if isinstance(output, TeacherOutput) and self.dense_weight > 0:
+            maps = (output.mask_logits, output.normals, output.coordinates)
             dense = losses.dense_loss(*maps, truth.mask, truth.normals, truth.coordinates).mean()
             terms["dense"] = dense
             terms["total"] = terms["total"] + self.dense_weight * dense

@@ -1,7 +1,8 @@
-"""What the frozen teacher says about the captured crops: poses, masks, normals, and how far to trust them.
+"""What the teacher says about captured crops: poses, masks, normals, and how far to trust them.
 
-The teacher is run once over the upright crops; its answers are carried along with the augmentation, exactly
-for in-plane rotation, instead of running it on every augmented crop (our choice).
+A frozen teacher is run once over the upright crops; its answers are carried along with the augmentation,
+exactly for in-plane rotation, instead of running it on every augmented crop (our choice). A teacher that
+follows its student answers on each batch.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from torch import Tensor
 
 from s2p3 import losses
 from s2p3.config import ExperimentConfig, SelfSupervisionConfig
-from s2p3.inputs import View
+from s2p3.inputs import NetworkInput, View
 from s2p3.networks.pose_head import decode_pose
-from s2p3.networks.teacher import MAP_STRIDE, Teacher
+from s2p3.networks.teacher import MAP_STRIDE, Teacher, TeacherOutput
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training.batches import form_input, turn_maps, turn_vectors, view_window
@@ -32,63 +33,77 @@ class PseudoLabels:
     Attributes:
         rotation, translation: (N, 3, 3) and (N, 3), its pose.
         mask: (N, 1, S/4, S/4), 0 to 1, and normals: (N, 3, S/4, S/4): its predicted maps.
-        delta: (N,) discrepancy between its predicted mask and the one rendered at its pose.
-        threshold: the r of the delta rule.
+        rendered_mask, rendered_normals: the same rendered at its pose.
+        delta: (N,) discrepancy between the two masks.
     """
 
     rotation: Tensor
     translation: Tensor
     mask: Tensor
     normals: Tensor
+    rendered_mask: Tensor
+    rendered_normals: Tensor
     delta: Tensor
-    threshold: float
+
+    def threshold(self, settings: SelfSupervisionConfig) -> float:
+        """The r of the delta rule over these crops."""
+        return settings.threshold or float(torch.quantile(self.delta, settings.threshold_quantile))
+
+
+@torch.no_grad()
+def labels_of(output: TeacherOutput, seen: NetworkInput, mesh: RenderMesh, diameter_m: float) -> PseudoLabels:
+    """What a teacher's answer on a batch says."""
+    rotation, translation, _ = decode_pose(output.pose, seen.K, seen.size, diameter_m)
+    mask = output.mask_logits.sigmoid()
+    drawn = pooled_maps(render(mesh, rotation, translation, seen.K, seen.size, seen.size, silhouette=False))
+    return PseudoLabels(
+        rotation, translation, mask, output.normals, *drawn, losses.discrepancy(mask, drawn[0])
+    )
 
 
 @torch.no_grad()
 def make_labels(
-    teacher: Teacher,
-    crops: Crops,
-    model: ObjectModel,
-    config: ExperimentConfig,
-    settings: SelfSupervisionConfig,
+    teacher: Teacher, crops: Crops, model: ObjectModel, mesh: RenderMesh, config: ExperimentConfig
 ) -> PseudoLabels:
     """Runs the teacher over every crop at the nominal zoom."""
-    mesh = RenderMesh.from_mesh(model.mesh)
     teacher.eval()
-    rows = []
+    parts = []
     for start in range(0, len(crops), _CHUNK):
         indices = torch.arange(start, min(start + _CHUNK, len(crops)))
         view = View.centred(len(indices), config.input.zoom)
         seen = form_input(crops, indices, view, model.refractive_index, config)
-        output = teacher(seen.polarization, seen.priors)
-        rotation, translation, _ = decode_pose(output.pose, seen.K, seen.size, model.diameter)
-        mask = output.mask_logits.sigmoid()
-        drawn, _ = pooled_maps(
-            render(mesh, rotation, translation, seen.K, seen.size, seen.size, silhouette=False)
-        )
-        rows.append((rotation, translation, mask, output.normals, losses.discrepancy(mask, drawn)))
-    rotation, translation, mask, normals, delta = (torch.cat(column) for column in zip(*rows, strict=True))
-    threshold = settings.threshold or float(torch.quantile(delta, settings.threshold_quantile))
-    return PseudoLabels(rotation, translation, mask, normals, delta, threshold)
+        parts.append(labels_of(teacher(seen.polarization, seen.priors), seen, mesh, model.diameter))
+    names = vars(parts[0])
+    return PseudoLabels(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
+@torch.no_grad()
 def carry_labels(
-    labels: PseudoLabels, crops: Crops, indices: Tensor, view: View, config: ExperimentConfig
+    labels: PseudoLabels,
+    crops: Crops,
+    indices: Tensor,
+    view: View,
+    mesh: RenderMesh,
+    config: ExperimentConfig,
 ) -> PseudoLabels:
-    """The labels of the chosen crops as they look through `view`."""
-    window = view_window(crops, indices, view, config, config.input.size // MAP_STRIDE)
+    """The labels of the chosen crops as they look through `view`; the teacher's pose is rendered anew."""
+    size = config.input.size
+    window = view_window(crops, indices, view, config, size // MAP_STRIDE)
     side = crops.stokes.shape[-1]
     labelled_half = config.input.zoom * side / config.input.canonical_zoom / 2
     grid = (window.source + 0.5 - side / 2) / labelled_half  # -1 to 1 across the region the teacher saw
     maps = torch.cat([labels.mask[indices], labels.normals[indices]], dim=1)
     maps = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
+    rotation = window.rotation @ labels.rotation[indices]
+    translation = turn_vectors(window.rotation, labels.translation[indices])
+    K = view_window(crops, indices, view, config, size).K
     return PseudoLabels(
-        rotation=window.rotation @ labels.rotation[indices],
-        translation=turn_vectors(window.rotation, labels.translation[indices]),
-        mask=maps[:, :1],
-        normals=F.normalize(turn_maps(window.rotation, maps[:, 1:]), dim=1),
-        delta=labels.delta[indices],
-        threshold=labels.threshold,
+        rotation,
+        translation,
+        maps[:, :1],
+        F.normalize(turn_maps(window.rotation, maps[:, 1:]), dim=1),
+        *pooled_maps(render(mesh, rotation, translation, K, size, size, silhouette=False)),
+        labels.delta[indices],
     )
 
 

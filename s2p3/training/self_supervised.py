@@ -1,13 +1,12 @@
-"""The self-supervised stage: the student learns from the frozen teacher's pseudo labels and from the
-polarization itself.
+"""The self-supervised stage: the student learns from the teacher's pseudo labels and from the polarization
+itself.
 
-Takes `Crops`: Stokes values in predicted boxes, predicted masks, crop intrinsics. No pose of a captured frame
-is an argument, so none can be used.
+Takes `Crops`: Stokes values in predicted boxes, predicted masks, crop intrinsics, depth where a depth camera
+was there. No pose of a captured frame is an argument, so none can be used.
 """
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,18 +19,21 @@ from s2p3 import losses, physics
 from s2p3.config import ExperimentConfig, SelfSupervisionConfig
 from s2p3.inputs import NetworkInput, View
 from s2p3.networks.pose_head import decode_pose
-from s2p3.networks.teacher import MAP_STRIDE, pose_of
+from s2p3.networks.student import Student
+from s2p3.networks.teacher import MAP_STRIDE, Teacher, TeacherOutput, pose_of
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
 from s2p3.training.adaptation import adapt_batch_norm, set_momentum
 from s2p3.training.batches import form_input
 from s2p3.training.checkpoint import CheckpointInfo
-from s2p3.training.crops import Crops
+from s2p3.training.crops import Crops, crops_hash
 from s2p3.training.loop import Forward, Losses, optimize
+from s2p3.training.mean_teacher import MeanTeacher
 from s2p3.training.pretrain import load_student, load_teacher, model_tensors
 from s2p3.training.progress import OnStep
-from s2p3.training.pseudo_labels import PseudoLabels, carry_labels, make_labels, pooled_maps
+from s2p3.training.pseudo_labels import PseudoLabels, carry_labels, labels_of, make_labels, pooled_maps
+from s2p3.training.signal import captured_signal, report_signal
 
 _BATCH_NORM_MOMENTUM = 0.02
 
@@ -47,7 +49,7 @@ def self_supervise(
     workers: int = 0,
 ) -> Path:
     """Adapts the pre-trained student to captured frames and writes `out`/adapted.safetensors, which is
-    returned.
+    returned. NAME.signal.json beside it says what the frames' polarization tells, at the teacher's poses.
 
     Args:
         crops: of captured frames, see `crops.captured_crops`.
@@ -55,50 +57,86 @@ def self_supervise(
         settings: weights and schedule; by default those the student's experiment holds.
         on_step, workers: see `loop.optimize`.
 
-    Raises ToolkitError: checkpoints of another object or of different inputs; see also `loop.optimize`.
+    Raises ToolkitError: checkpoints of another object or of different inputs; a depth loss without depth; a
+        teacher that is to follow a student of another architecture; see also `loop.optimize`.
     """
-    guide, guide_info = load_teacher(teacher, model.name)
-    network, info = load_student(student, model.name)
-    config = info.config
-    if guide_info.config.input != config.input:
+    pair = load_pair(teacher, student, model.name)
+    settings = settings or pair.config.self_supervision
+    if settings.depth != "none" and crops.depth is None:
         raise ToolkitError(
-            f"{teacher} and {student} expect different inputs; train both with one experiment.toml"
+            f'self_supervision.depth = "{settings.depth}" needs depth, and the session has none; '
+            'record it, or set depth = "none"'
         )
-    settings = settings or config.self_supervision
+    network: Student | Teacher | MeanTeacher = pair.student
     if settings.adapt_batches:
-        adapt_batch_norm(network, crops, model.refractive_index, config, settings)
+        adapt_batch_norm(pair.student, crops, model.refractive_index, pair.config, settings)
         if settings.adapt_teacher:
-            adapt_batch_norm(guide, crops, model.refractive_index, config, settings)
-    labels = make_labels(guide, crops, model, config, settings)
-    set_momentum(network, _BATCH_NORM_MOMENTUM)
-    data = _CapturedData(crops, labels, RenderMesh.from_mesh(model.mesh), model.refractive_index, config)
-    points, symmetries = model_tensors(model)
-    objective = _Objective(
-        data.mesh, points, symmetries, labels.threshold, model.diameter, model.refractive_index, settings
-    )
+            adapt_batch_norm(pair.teacher, crops, model.refractive_index, pair.config, settings)
+    mesh = RenderMesh.from_mesh(model.mesh)
+    labels = make_labels(pair.teacher, crops, model, mesh, pair.config)
     path = out / "adapted.safetensors"
-    hashes = {"crops": hashlib.sha256(crops.stokes.numpy().tobytes()).hexdigest()[:16]}
-    run = f"{hashes} {guide_info} {info}"
-    trained = optimize(
-        network, data, objective, settings, path, run, "self-supervision", workers=workers, on_step=on_step
+    report_signal(captured_signal(crops, labels.rotation, labels.translation, model), path)
+    set_momentum(pair.student, _BATCH_NORM_MOMENTUM)
+    if settings.teacher == "ema":
+        network = _following(pair, student, settings)
+    data = CapturedData(crops, labels, mesh, model.refractive_index, pair.config)
+    objective = _Objective(
+        mesh,
+        *model_tensors(model),
+        labels.threshold(settings),
+        model.diameter,
+        model.refractive_index,
+        settings,
     )
-    info = CheckpointInfo.of("student", "self-supervised", model, trained.step, config, hashes)
-    checkpoint.save(path, trained.network.state_dict(), info)
+    hashes = {"crops": crops_hash(crops)}
+    trained = optimize(
+        network,
+        data,
+        objective,
+        settings,
+        path,
+        f"{hashes} {pair.described}",
+        "self-supervision",
+        workers=workers,
+        on_step=on_step,
+    )
+    kept = trained.network.student if isinstance(trained.network, MeanTeacher) else trained.network
+    info = CheckpointInfo.of("student", "self-supervised", model, trained.step, pair.config, hashes)
+    checkpoint.save(path, kept.state_dict(), info)
     return path
 
 
 @dataclass(frozen=True)
-class _Batch:
-    """What the student sees of B crops, what the teacher says about them, and its pose rendered."""
+class Pair:
+    """Teacher and student that see the same, the experiment they share, and what they are, in words."""
 
-    seen: NetworkInput
-    target: PseudoLabels
-    teacher_mask: Tensor
-    teacher_normals: Tensor
+    teacher: Teacher
+    student: Student | Teacher
+    config: ExperimentConfig
+    described: str
+
+
+def load_pair(teacher: Path, student: Path, object_name: str) -> Pair:
+    """Reads both. Raises ToolkitError: of another object, or of different inputs."""
+    guide, guide_info = load_teacher(teacher, object_name)
+    network, info = load_student(student, object_name)
+    if guide_info.config.input != info.config.input:
+        raise ToolkitError(
+            f"{teacher} and {student} expect different inputs; train both with one experiment.toml"
+        )
+    return Pair(guide, network, info.config, f"{guide_info} {info}")
 
 
 @dataclass(frozen=True)
-class _CapturedData:
+class CapturedBatch:
+    """What the networks see of B crops, and what the teacher says about them."""
+
+    seen: NetworkInput
+    target: PseudoLabels
+
+
+@dataclass(frozen=True)
+class CapturedData:
     """Augmented batches of captured crops, see `loader.Data`."""
 
     crops: Crops
@@ -111,13 +149,10 @@ class _CapturedData:
         return len(self.crops)
 
     @torch.no_grad()
-    def __call__(self, rows: Tensor, generator: torch.Generator) -> _Batch:
+    def __call__(self, rows: Tensor, generator: torch.Generator) -> CapturedBatch:
         view = View.random(len(rows), self.config.augmentation, generator)
         seen = form_input(self.crops, rows, view, self.refractive_index, self.config, generator)
-        target = carry_labels(self.labels, self.crops, rows, view, self.config)
-        pose, size = (target.rotation, target.translation), seen.size
-        maps = pooled_maps(render(self.mesh, *pose, seen.K, size, size, silhouette=False))
-        return _Batch(seen, target, *maps)
+        return CapturedBatch(seen, carry_labels(self.labels, self.crops, rows, view, self.mesh, self.config))
 
 
 @dataclass(frozen=True)
@@ -132,37 +167,44 @@ class _Objective:
     refractive_index: float
     settings: SelfSupervisionConfig
 
-    def __call__(self, forward: Forward, batch: _Batch) -> Losses:
-        seen, target = batch.seen, batch.target
-        output = pose_of(forward(seen.polarization, seen.priors))
-        rotation, translation, _ = decode_pose(output, seen.K, seen.size, self.diameter_m)
+    def __call__(self, forward: Forward, batch: CapturedBatch) -> Losses:
+        seen, target, settings = batch.seen, batch.target, self.settings
+        output = forward(seen.polarization, seen.priors)
+        if isinstance(output, tuple):  # a `MeanTeacher`: its teacher answers anew
+            output, said = output
+            target = labels_of(said, seen, self.mesh, self.diameter_m)
+        rotation, translation, _ = decode_pose(pose_of(output), seen.K, seen.size, self.diameter_m)
         rendered = render(self.mesh, rotation, translation, seen.K, seen.size, seen.size)
-        mask, normals = pooled_maps(rendered)
         pose = (target.rotation, target.translation)
-        rule = (target.delta, self.threshold)
-        target_mask = losses.pseudo_maps(*rule, batch.teacher_mask, target.mask)
-        target_normals = losses.pseudo_maps(*rule, batch.teacher_normals, target.normals)
         distance = losses.pose_loss(self.points, rotation, translation, *pose, self.symmetries)
-        settings = self.settings
-        terms = {
-            "pose": (losses.pose_weight(target.delta) * distance).mean() / self.diameter_m,
-            "mask": losses.mask_loss(mask, target_mask).mean(),
-            "normals": losses.normals_loss(normals, target_normals, mask, target_mask).mean(),
-        }
-        total = (
-            settings.pose_weight * terms["pose"]
-            + settings.mask_weight * terms["mask"]
-            + settings.normals_weight * terms["normals"]
-        )
+        weighted = losses.pose_weight(target.delta) * distance / self.diameter_m
+        mask_error, normals_error = self._geometry(output, rendered, target)
+        terms = {"pose": weighted.mean(), "mask": mask_error, "normals": normals_error}
         if settings.physics != "none":
             terms["physics"] = self._physics(seen, rendered, target.mask).mean()
-            total = total + settings.physics_weight * terms["physics"]
-        return {"total": total, **terms}
+        if settings.depth != "none":
+            terms["depth"] = self._depth(seen, rendered, target.mask).mean() / self.diameter_m
+        weights = {name: getattr(settings, f"{name}_weight") for name in terms}
+        return {"total": torch.stack([weights[name] * terms[name] for name in terms]).sum(), **terms}
+
+    def _geometry(
+        self, output: Tensor | TeacherOutput, rendered: RenderOutput, target: PseudoLabels
+    ) -> tuple[Tensor, Tensor]:
+        """L_mask and L_normals of what is rendered at the student's pose; of the large student, plus those of
+        what it predicts."""
+        rule = (target.delta, self.threshold)
+        true_mask = losses.pseudo_maps(*rule, target.rendered_mask, target.mask)
+        true_normals = losses.pseudo_maps(*rule, target.rendered_normals, target.normals)
+        maps = [pooled_maps(rendered)]
+        if isinstance(output, TeacherOutput):
+            maps.append((output.mask_logits.sigmoid(), output.normals))
+        masks = [losses.mask_loss(mask, true_mask).mean() for mask, _ in maps]
+        normals = [losses.normals_loss(n, true_normals, mask, true_mask).mean() for mask, n in maps]
+        return torch.stack(masks).sum(), torch.stack(normals).sum()
 
     def _physics(self, seen: NetworkInput, rendered: RenderOutput, predicted_mask: Tensor) -> Tensor:
         """L_physics where the rendered and the teacher's predicted mask agree (our choice of pixels)."""
-        fine = F.interpolate(predicted_mask, scale_factor=float(MAP_STRIDE), mode="bilinear")
-        inside = (rendered.mask.detach() > 0.5) & (fine > 0.5)
+        inside = (rendered.mask.detach() > 0.5) & (enlarged(predicted_mask) > 0.5)
         stokes = seen.stokes
         if self.settings.smoothing > 1:
             side = self.settings.smoothing
@@ -176,3 +218,33 @@ class _Objective:
             inside.float(),
             self.refractive_index,
         )
+
+    def _depth(self, seen: NetworkInput, rendered: RenderOutput, predicted_mask: Tensor) -> Tensor:
+        """The losses of the paper's depth ablation, metres, on what is measured in the predicted mask."""
+        assert seen.depth is not None
+        inside = (enlarged(predicted_mask) > 0.5).float()
+        if self.settings.depth == "pixel":
+            return losses.depth_loss(rendered.depth, seen.depth, inside)
+        return losses.chamfer_loss(*clouds(seen, rendered, inside))
+
+
+def enlarged(maps: Tensor) -> Tensor:
+    """A teacher's maps at the resolution of its input."""
+    return F.interpolate(maps, scale_factor=float(MAP_STRIDE), mode="bilinear")
+
+
+def clouds(seen: NetworkInput, rendered: RenderOutput, inside: Tensor) -> tuple[Tensor, Tensor]:
+    """Measured points inside a mask, and the points rendered at the student's pose, each (B, n, 3)."""
+    assert seen.depth is not None
+    measured = losses.back_project(seen.depth, inside, seen.K, losses.CLOUD_POINTS)
+    return measured, losses.back_project(rendered.depth, rendered.mask.detach(), seen.K, losses.CLOUD_POINTS)
+
+
+def _following(pair: Pair, path: Path, settings: SelfSupervisionConfig) -> MeanTeacher:
+    """Raises ToolkitError: teacher and student are not of one architecture."""
+    if not isinstance(pair.student, Teacher):
+        raise ToolkitError(
+            f"{path}: a teacher can follow only a student of its own architecture; train one with "
+            'network.student = "large", or set self_supervision.teacher = "frozen"'
+        )
+    return MeanTeacher(pair.student, pair.teacher, settings.teacher_decay)

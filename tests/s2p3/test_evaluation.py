@@ -16,11 +16,11 @@ from dataset.session import Session, mask_box
 from s2p3 import config as presets
 from s2p3.evaluation import Estimator, Evaluation, Finder, evaluate, find_objects
 from s2p3.evaluation.report import chosen_records, evaluation_section
+from s2p3.networks.build import build_student
 from s2p3.networks.detector import Detection, Detector
 from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
 from s2p3.training.checkpoint import CheckpointInfo, Kind
-from s2p3.training.pretrain import build_student
 from tests.s2p3.evaluations import evaluation, record
 
 

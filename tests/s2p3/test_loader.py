@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 import runpy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,8 @@ from s2p3.config import fast
 from s2p3.objects import build
 from s2p3.training.crops import LabelledCrops, collate, labelled_crops
 from s2p3.training.loader import CropDataset, Share, Steps, stream
+from s2p3.training.pretrain import LabelledData
+from s2p3.training.trees import named_tensors
 
 
 @pytest.fixture(scope="module")
@@ -27,12 +29,15 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-CONFIG = replace(fast().input, size=32, canonical_size=48)
+CONFIG = replace(fast().input, canonical_size=48)
+EXPERIMENT = replace(fast(), input=CONFIG)
 
 
 def same(one: LabelledCrops, other: LabelledCrops, tolerance: float) -> None:
-    for field in fields(LabelledCrops):
-        a, b = getattr(one, field.name), getattr(other, field.name)
+    found, expected = one.tensors(), other.tensors()
+    assert set(found) == set(expected)
+    for name, a in found.items():
+        b = expected[name]
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
         torch.testing.assert_close(a.float(), b.float(), atol=tolerance, rtol=tolerance)
 
@@ -45,29 +50,24 @@ def test_rows_are_those_of_training_in_memory(session: Path) -> None:
     same(collate([data[row] for row in range(len(data))]), expected, 2e-3)
 
 
-@dataclass(frozen=True)
-class Plain:
-    """The crops themselves, with a number that only their generator decides."""
-
-    crops: CropDataset | LabelledCrops
-
-    def __len__(self) -> int:
-        return len(self.crops)
-
-    def __call__(self, rows: Tensor, generator: torch.Generator) -> tuple[LabelledCrops, Tensor]:
-        return self.crops.take(rows), torch.rand(1, generator=generator)
+def augmented(source: CropDataset | LabelledCrops) -> LabelledData:
+    return LabelledData(source, torch.arange(6), 1.5, EXPERIMENT)
 
 
-def test_workers_make_the_same_batches_from_any_step_on(session: Path) -> None:
-    data = CropDataset([session], build("cup"), CONFIG)
-    here = list(stream(Steps(Plain(data), 2, seed=3), 0, 5))
-    spawned = list(stream(Steps(Plain(data), 2, seed=3), 2, 5, workers=2))
-    for (one, number), (other, its_number) in zip(here[2:], spawned, strict=True):
-        same(one, other, 0)
-        assert number == its_number
-    assert len({float(number) for _, number in here}) == 5
-    first_epoch = [int(row) for batch, _ in here[:3] for row in batch.frames]
-    assert sorted(first_epoch) == list(range(6))
+def test_workers_make_the_same_batches_from_any_step_on_memory_or_disk(session: Path) -> None:
+    model = build("cup")
+    crops = labelled_crops([session], model, CONFIG)
+    here = [named_tensors(batch, "") for batch in stream(Steps(augmented(crops), 2, seed=3), 0, 5)]
+    spawned = stream(Steps(augmented(crops), 2, seed=3), 2, 5, workers=1)
+    for one, other in zip(here[2:], spawned, strict=True):
+        parts = named_tensors(other, "")
+        assert one.keys() == parts.keys()
+        assert all(torch.equal(one[name], parts[name]) for name in one)
+        assert parts[".seen.priors"].is_contiguous(memory_format=torch.channels_last)
+    off_disk = stream(Steps(augmented(CropDataset([session], model, CONFIG)), 2, seed=3), 2, 5)
+    for one, other in zip(here[2:], off_disk, strict=True):
+        for name, part in named_tensors(other, "").items():
+            torch.testing.assert_close(part, one[name], atol=0.05, rtol=0.05)
 
 
 def test_a_data_set_travels_without_its_handles(session: Path) -> None:
@@ -114,7 +114,7 @@ def test_what_keeps_a_worker_from_its_batch_is_said_in_one_line(session: Path) -
     broken = CropDataset([session], build("cup"), CONFIG)
     broken.paths[0] = session.with_name("gone.h5")
     with pytest.raises(ToolkitError, match=r"^[^\n]*gone.h5[^\n]*$"):
-        next(stream(Steps(Plain(broken), 2, seed=3), 0, 5, workers=1))
+        next(stream(Steps(augmented(broken), 2, seed=3), 0, 5, workers=1))
 
 
 @pytest.mark.parametrize("rank", [-1, 2])

@@ -1,0 +1,291 @@
+"""Self-supervision in all its variants, and the RGB-D baseline: a few steps each, on eight small frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import warnings
+from pathlib import Path
+from typing import Literal
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from dataset.errors import ToolkitError, ToolkitWarning
+from dataset.session import Session, mask_box
+from dataset.session.edit import write_depth
+from s2p3 import config as presets
+from s2p3.config import ExperimentConfig, SelfSupervisionConfig
+from s2p3.networks.build import build_student, build_teacher
+from s2p3.networks.detector import Detection
+from s2p3.networks.teacher import Teacher, TeacherOutput
+from s2p3.objects import ObjectModel
+from s2p3.rendering import rasterize
+from s2p3.rendering.differentiable import RenderMesh
+from s2p3.synthesis.informativeness import Informativeness
+from s2p3.training import Crops, captured_crops, checkpoint, labelled_crops, self_supervise
+from s2p3.training.mean_teacher import MeanTeacher
+from s2p3.training.pseudo_labels import labels_of, make_labels
+from s2p3.training.self6d import self_supervise_rgbd
+from s2p3.training.signal import captured_signal, labelled_signal, objection, report_signal
+from tests.s2p3.untrained import save_untrained
+
+
+def tiny(
+    modality: Literal["polarization", "rgb", "rgbd"] = "polarization",
+    student: Literal["direct", "large"] = "direct",
+) -> ExperimentConfig:
+    base = presets.quick()
+    return dataclasses.replace(
+        base,
+        input=dataclasses.replace(base.input, modality=modality),
+        network=dataclasses.replace(base.network, student=student),
+        self_supervision=dataclasses.replace(base.self_supervision, steps=2, batch=2, adapt_batches=1),
+        self6d=dataclasses.replace(base.self6d, steps=2, batch=2),
+    )
+
+
+def silent(step: int, steps: int, values: dict[str, float]) -> None:
+    del step, steps, values
+
+
+@pytest.fixture(scope="module")
+def with_depth(cup_session: Path, cup: ObjectModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The session of the cup with the depth of the cup alone."""
+    path = Path(shutil.copy(cup_session, tmp_path_factory.mktemp("depth") / "cup.h5"))
+    with Session.open(path) as session:
+        poses = session.object_poses("cup")
+        depths = [rasterize(cup.mesh, pose, session.working_intrinsics).depth for pose in poses.T_cam_obj]
+    write_depth(path, [np.rint(1000 * depth).astype(np.uint16) for depth in depths])
+    return path
+
+
+def confident(networks: dict[str, Path]) -> dict[str, Path]:
+    """The same networks, the teacher sure that it sees the object everywhere."""
+    weights = load_file(networks["teacher"])
+    weights["maps.bias"][0] = 5.0
+    save_file(weights, networks["teacher"])
+    return networks
+
+
+def crops_of(path: Path, config: ExperimentConfig) -> Crops:
+    with Session.open(path) as session:
+        masks = [session.object_poses("cup").mask(index) for index in range(len(session))]
+        found: list[Detection | None] = [Detection(mask_box(mask), mask, 0.9) for mask in masks]
+        return captured_crops(session, range(len(session)), found, config.input)
+
+
+def run(
+    path: Path, cup: ObjectModel, config: ExperimentConfig, folder: Path, **changes: object
+) -> tuple[dict[str, float], Path]:
+    """The last logged losses, and the adapted checkpoint."""
+    networks = confident(save_untrained(folder, cup, config))
+    settings = dataclasses.replace(config.self_supervision, **changes)  # type: ignore[arg-type]
+    out = self_supervise(
+        crops_of(path, config),
+        cup,
+        networks["teacher"],
+        networks["student"],
+        folder / "out",
+        settings,
+        silent,
+    )
+    return json.loads(out.with_suffix(".log.jsonl").read_text().splitlines()[-1]), out
+
+
+@pytest.mark.parametrize(
+    ("changes", "terms"),
+    [
+        ({}, {"pose", "mask", "normals", "physics"}),
+        ({"physics": "aolp"}, {"pose", "mask", "normals", "physics"}),
+        ({"physics": "dolp-gain"}, {"pose", "mask", "normals", "physics"}),
+        ({"physics": "none"}, {"pose", "mask", "normals"}),
+        ({"physics": "none", "depth": "chamfer"}, {"pose", "mask", "normals", "depth"}),
+        ({"physics": "none", "depth": "pixel"}, {"pose", "mask", "normals", "depth"}),
+    ],
+)
+def test_the_total_is_the_weighted_sum_of_the_terms(
+    changes: dict[str, object], terms: set[str], with_depth: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    config = tiny()
+    last, out = run(with_depth, cup, config, tmp_path, **changes)
+    assert terms == set(last) - {"step", "seconds", "learning_rate", "total"}
+    assert all(last[name] > 0 for name in terms)
+    total = sum(getattr(config.self_supervision, f"{name}_weight") * last[name] for name in terms)
+    assert last["total"] == pytest.approx(total, rel=1e-5)
+    assert checkpoint.read_info(out, "student", "cup").stage == "self-supervised"
+
+
+def test_a_depth_loss_without_depth_is_refused(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
+    with pytest.raises(ToolkitError, match="needs depth, and the session has none"):
+        run(cup_session, cup, tiny(), tmp_path, depth="chamfer")
+
+
+def test_the_large_student_learns_by_what_it_predicts_too(
+    cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    config = tiny(student="large")
+    last, out = run(cup_session, cup, config, tmp_path)
+    direct, _ = run(cup_session, cup, tiny(), tmp_path / "direct")
+    assert last["mask"] > direct["mask"] > 0
+    assert {"maps.weight"} < set(load_file(out))
+
+
+def test_an_ema_teacher_follows_a_student_of_its_kind(
+    cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    last, out = run(cup_session, cup, tiny(student="large"), tmp_path, teacher="ema")
+    assert set(load_file(out)) == set(build_teacher(tiny()).state_dict())
+    assert last["total"] > 0
+    with pytest.raises(ToolkitError, match=r'network\.student = "large"'):
+        run(cup_session, cup, tiny(), tmp_path / "direct", teacher="ema")
+
+
+def test_the_mean_teacher_moves_by_the_decay_and_has_no_gradient() -> None:
+    torch.manual_seed(0)
+    student, teacher = (build_teacher(tiny()) for _ in range(2))
+    pair = MeanTeacher(student, teacher, 0.9).train()
+    before = {name: value.clone() for name, value in teacher.state_dict().items()}
+    followed = {name: value.clone() for name, value in student.state_dict().items()}
+    images = torch.randn(2, 7, 64, 64), torch.randn(2, 9, 64, 64)
+    answer, said = pair(*images)
+    for name in ("maps.weight", "encoder.polarization.stem.1.running_mean"):
+        expected = 0.9 * before[name] + 0.1 * followed[name]
+        torch.testing.assert_close(teacher.state_dict()[name], expected)
+    (answer.pose.sum() + said.pose.sum()).backward()
+    assert all(weight.grad is None for weight in teacher.parameters())
+    assert not teacher.training
+    still = {name: value.clone() for name, value in teacher.state_dict().items()}
+    pair.eval()(*images)
+    assert all(torch.equal(still[name], value) for name, value in teacher.state_dict().items())
+
+
+def test_labels_made_over_all_crops_are_those_of_each_batch(cup_session: Path, cup: ObjectModel) -> None:
+    config, mesh = tiny(), RenderMesh.from_mesh(cup.mesh)
+    crops = labelled_crops([cup_session], cup, config.input, on_step=silent)
+    teacher = build_teacher(config).eval()
+    labels = make_labels(teacher, crops, cup, mesh, config)
+    assert labels.rotation.shape == (8, 3, 3)
+    agreed = SelfSupervisionConfig(threshold=0.25)
+    assert labels.threshold(agreed) == 0.25
+    quantile = labels.threshold(SelfSupervisionConfig(threshold_quantile=0.5))
+    assert quantile == pytest.approx(float(labels.delta.median()), abs=0.2)
+    output = TeacherOutput(
+        torch.zeros(1, 9),
+        torch.full((1, 1, 16, 16), 9.0),
+        torch.zeros(1, 3, 16, 16),
+        torch.zeros(1, 3, 16, 16),
+    )
+    from s2p3.inputs import View
+    from s2p3.training.batches import form_input
+
+    seen = form_input(crops, torch.tensor([0]), View.centred(1, 1.4), 1.5, config)
+    said = labels_of(output, seen, mesh, cup.diameter)
+    covered = said.rendered_mask.mean()
+    assert float(said.delta) == pytest.approx(
+        1 - float(covered), abs=0.01
+    )  # against a mask that is everywhere
+
+
+@pytest.fixture(scope="module")
+def baseline(cup: ObjectModel, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return confident(save_untrained(tmp_path_factory.mktemp("rgb"), cup, tiny("rgb")))
+
+
+def test_the_rgbd_baseline_adapts_by_appearance_and_depth(
+    baseline: dict[str, Path], with_depth: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    config = tiny("rgb")
+    crops = crops_of(with_depth, config)
+    out = self_supervise_rgbd(crops, cup, baseline["teacher"], baseline["student"], tmp_path, on_step=silent)
+    last = json.loads(out.with_suffix(".log.jsonl").read_text().splitlines()[-1])
+    assert {"pose", "mask", "chamfer", "colour", "structure"} < set(last)
+    assert "perceptual" not in last
+    assert last["colour"] == pytest.approx(0, abs=1e-3)  # of grey images
+    assert last["chamfer"] > 0
+    before, after = load_file(baseline["student"]), load_file(out)
+    assert set(before) == set(after)
+    statistics = [name for name in before if "running" in name]
+    assert all(torch.equal(before[name], after[name]) for name in statistics)  # BatchNorm is frozen
+    assert not torch.equal(before["pose.output.weight"], after["pose.output.weight"])
+
+
+def test_the_baseline_uses_lpips_where_its_weights_are_named(
+    baseline: dict[str, Path], with_depth: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    from tests.s2p3.test_appearance_losses import stored_weights
+
+    config = tiny("rgb")
+    weights = str(stored_weights(tmp_path / "lpips.safetensors"))
+    settings = dataclasses.replace(config.self6d, steps=1, lpips_weights=weights)
+    networks = (baseline["teacher"], baseline["student"])
+    out = self_supervise_rgbd(crops_of(with_depth, config), cup, *networks, tmp_path, settings, silent)
+    assert json.loads(out.with_suffix(".log.jsonl").read_text().splitlines()[-1])["perceptual"] > 0
+
+
+def test_the_baseline_refuses_polarization_and_missing_depth(
+    baseline: dict[str, Path], cup_session: Path, with_depth: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    networks = (baseline["teacher"], baseline["student"])
+    with pytest.raises(ToolkitError, match="the session has none"):
+        self_supervise_rgbd(crops_of(cup_session, tiny("rgb")), cup, *networks, tmp_path)
+    polarized = save_untrained(tmp_path, cup, tiny())
+    with pytest.raises(ToolkitError, match=r"sees polarization.*input.modality"):
+        self_supervise_rgbd(
+            crops_of(with_depth, tiny()), cup, polarized["teacher"], polarized["student"], tmp_path
+        )
+
+
+def test_the_signal_of_a_specular_cup_is_seen(cup_session: Path, cup: ObjectModel) -> None:
+    crops = labelled_crops([cup_session], cup, tiny().input, on_step=silent)
+    figures = labelled_signal(crops, torch.arange(8), cup)
+    assert figures.images == 8
+    assert figures.dolp_residual < 0.5 * figures.dolp_residual_shuffled
+    assert objection(figures) is None
+    at_truth = captured_signal(crops, crops.rotation, crops.translation, cup)
+    assert at_truth.dolp_residual == pytest.approx(figures.dolp_residual, abs=0.03)
+
+
+def test_unpolarized_light_is_warned_about(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
+    crops = labelled_crops([cup_session], cup, tiny().input, on_step=silent)
+    faint = crops.stokes.clone()
+    noise = torch.randn(faint[:, 1:].shape, generator=torch.Generator().manual_seed(0))
+    faint[:, 1:] = (0.02 * faint[:, :1] * noise).to(faint.dtype)
+    figures = labelled_signal(dataclasses.replace(crops, stokes=faint), torch.arange(8), cup)
+    with pytest.warns(ToolkitWarning, match="teacher: L_physics cannot help here"):
+        report_signal(figures, tmp_path / "teacher.safetensors")
+    stored = (tmp_path / "teacher.signal.json").read_text()
+    assert Informativeness.from_json(stored) == figures
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report_signal(labelled_signal(crops, torch.arange(8), cup), tmp_path / "student.safetensors")
+    assert objection(Informativeness.mean([])) is not None
+
+
+def test_depth_is_cut_on_the_grid_of_the_crops(with_depth: Path, cup: ObjectModel) -> None:
+    crops = labelled_crops([with_depth], cup, tiny().input, on_step=silent)
+    assert crops.depth is not None
+    covered = (crops.normals.norm(dim=1) > 0.5) & (crops.depth[:, 0] > 0)
+    assert covered.float().mean() > 0.1
+    # the depth of the object's coordinates, placed by its pose
+    lower, extent = torch.from_numpy(cup.mesh.lower), torch.from_numpy(cup.mesh.extent)
+    points = lower[:, None, None] + extent[:, None, None] * (crops.coordinates.float() + 1) / 2
+    z = torch.einsum("bj,bjhw->bhw", crops.rotation[:, 2], points) + crops.translation[:, 2, None, None]
+    error = (z - crops.depth[:, 0].float())[covered].abs()
+    assert error.median() < 0.002
+    assert (error < 0.01).float().mean() > 0.9
+
+
+def test_networks_that_see_depth_want_it(cup_session: Path, with_depth: Path, cup: ObjectModel) -> None:
+    config = tiny("rgbd")
+    with pytest.raises(ToolkitError, match="has no depth, and these networks see it"):
+        labelled_crops([cup_session], cup, config.input, on_step=silent)
+    assert isinstance(build_student(config), torch.nn.Module)
+    assert isinstance(build_student(tiny(student="large")), Teacher)
+    with h5py.File(with_depth) as file:
+        assert "depth" in file
+    assert labelled_crops([with_depth], cup, config.input, on_step=silent).depth is not None

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Row = NDArray[np.float32]
+Image = NDArray[np.float32]
 
 _VECTOR_MATH = {"arcp", "contract", "nsz", "afn"}
 """Reciprocals and roots may be off in the last bits; NaN and infinity keep their meaning."""
@@ -46,64 +47,67 @@ def _camera_frame(
 
 @numba.njit(cache=True, nogil=True, fastmath=_VECTOR_MATH, error_model="numpy")
 def priors(
-    stokes: NDArray[np.float32],
-    cameras: NDArray[np.float32],
+    s0s: Image,
+    s1s: Image,
+    s2s: Image,
+    pinhole: Row,
     index: np.float32,
     dark: np.float32,
+    top: int,
     out: NDArray[np.float32],
 ) -> None:
-    """(B, 3, H, W) Stokes and (B, 4) fx, fy, cx, cy -> (B, 9, H, W) normals n_d, n_s1, n_s2."""
+    """Stokes images (h, W) and fx, fy, cx, cy -> normals n_d, n_s1, n_s2: rows `top` to `top + h` of
+    (9, H, W)."""
     a, b = index * index + _ONE, index * index - _ONE
     b2, n2, sqrt2n = b * b, _FOUR * index * index, np.sqrt(_TWO) * index
     grazing = b / (a + _TWO * index)  # m of the largest diffuse polarization, where k = 1 / n
     root_grazing = np.sqrt(grazing)
-    width = stokes.shape[3]
+    height, width = s0s.shape
     us, ray_z, bend, half, root, cosine, sine = np.empty((7, width), np.float32)
-    for image in range(stokes.shape[0]):
-        fx, fy, cx, cy = cameras[image]
+    fx, fy, cx, cy = pinhole
+    for x in range(width):
+        us[x] = (np.float32(x) - cx) / fx
+    for y in range(height):
+        row = top + y
+        v = (np.float32(row) - cy) / fy
         for x in range(width):
-            us[x] = (np.float32(x) - cx) / fx
-        for row in range(stokes.shape[2]):
-            v = (np.float32(row) - cy) / fy
-            s0s, s1s, s2s = stokes[image, 0, row], stokes[image, 1, row], stokes[image, 2, row]
-            for x in range(width):
-                s1, s2 = s1s[x], s2s[x]
-                polarized = np.sqrt(s1 * s1 + s2 * s2)
-                s0 = max(max(s0s[x], polarized), dark)
-                m = polarized / (s0 + np.sqrt((s0 - polarized) * (s0 + polarized)))
-                half[x], root[x] = m, np.sqrt(m)
-                # The azimuth, half the angle of (S1, S2), bisects that and the nearer half of the S1 axis.
-                longer = polarized + abs(s1)
-                scale = _rsqrt(max(_TWO * polarized * longer, _TINY))
-                longer, shorter = longer * scale, abs(s2) * scale
-                longer = longer if polarized > dark else _ONE
-                cosine[x], turned = (longer, shorter) if s1 >= 0 else (shorter, longer)
-                sine[x] = -turned if s2 < 0 else turned
-                c = _rsqrt(_ONE + us[x] * us[x] + v * v)
-                ray_z[x], bend[x] = c, _ONE / (_ONE + c)
+            s1, s2 = s1s[y, x], s2s[y, x]
+            polarized = np.sqrt(s1 * s1 + s2 * s2)
+            s0 = max(max(s0s[y, x], polarized), dark)
+            m = polarized / (s0 + np.sqrt((s0 - polarized) * (s0 + polarized)))
+            half[x], root[x] = m, np.sqrt(m)
+            # The azimuth, half the angle of (S1, S2), bisects that and the nearer half of the S1 axis.
+            longer = polarized + abs(s1)
+            scale = _rsqrt(max(_TWO * polarized * longer, _TINY))
+            longer, shorter = longer * scale, abs(s2) * scale
+            longer = longer if polarized > dark else _ONE
+            cosine[x], turned = (longer, shorter) if s1 >= 0 else (shorter, longer)
+            sine[x] = -turned if s2 < 0 else turned
+            c = _rsqrt(_ONE + us[x] * us[x] + v * v)
+            ray_z[x], bend[x] = c, _ONE / (_ONE + c)
 
-            ox, oy, oz = out[image, 0, row], out[image, 1, row], out[image, 2, row]
-            for x in range(width):
-                m, c = min(half[x], grazing), ray_z[x]
-                g = _rsqrt((_ONE + m) * (a * (_ONE + m) - _TWO * index * (_ONE - m)))
-                sin, z = _TWO * index * min(root[x], root_grazing) * g, (_ONE + m - index * (_ONE - m)) * g
-                normal = _camera_frame(cosine[x] * sin, -sine[x] * sin, z, us[x] * c, v * c, c, bend[x])
-                ox[x], oy[x], oz[x] = normal
+        ox, oy, oz = out[0, row], out[1, row], out[2, row]
+        for x in range(width):
+            m, c = min(half[x], grazing), ray_z[x]
+            g = _rsqrt((_ONE + m) * (a * (_ONE + m) - _TWO * index * (_ONE - m)))
+            sin, z = _TWO * index * min(root[x], root_grazing) * g, (_ONE + m - index * (_ONE - m)) * g
+            normal = _camera_frame(cosine[x] * sin, -sine[x] * sin, z, us[x] * c, v * c, c, bend[x])
+            ox[x], oy[x], oz[x] = normal
 
-            ox, oy, oz = out[image, 3, row], out[image, 4, row], out[image, 5, row]
-            for x in range(width):
-                m, c = half[x], ray_z[x]
-                r = np.sqrt(m * m * b2 + n2)
-                scale = _rsqrt(m * a + r)
-                sin, z = sqrt2n * root[x] * scale, -np.sqrt(r - m * b) * scale
-                normal = _camera_frame(-sine[x] * sin, -cosine[x] * sin, z, us[x] * c, v * c, c, bend[x])
-                ox[x], oy[x], oz[x] = normal
+        ox, oy, oz = out[3, row], out[4, row], out[5, row]
+        for x in range(width):
+            m, c = half[x], ray_z[x]
+            r = np.sqrt(m * m * b2 + n2)
+            scale = _rsqrt(m * a + r)
+            sin, z = sqrt2n * root[x] * scale, -np.sqrt(r - m * b) * scale
+            normal = _camera_frame(-sine[x] * sin, -cosine[x] * sin, z, us[x] * c, v * c, c, bend[x])
+            ox[x], oy[x], oz[x] = normal
 
-            ox, oy, oz = out[image, 6, row], out[image, 7, row], out[image, 8, row]
-            for x in range(width):
-                m, c = half[x], ray_z[x]
-                q = np.sqrt(b2 + n2 * m * m)
-                scale = _rsqrt(a + q)
-                sin, z = sqrt2n * scale, -_TWO * index * m * scale * _rsqrt(b + q)
-                normal = _camera_frame(-sine[x] * sin, -cosine[x] * sin, z, us[x] * c, v * c, c, bend[x])
-                ox[x], oy[x], oz[x] = normal
+        ox, oy, oz = out[6, row], out[7, row], out[8, row]
+        for x in range(width):
+            m, c = half[x], ray_z[x]
+            q = np.sqrt(b2 + n2 * m * m)
+            scale = _rsqrt(a + q)
+            sin, z = sqrt2n * scale, -_TWO * index * m * scale * _rsqrt(b + q)
+            normal = _camera_frame(-sine[x] * sin, -cosine[x] * sin, z, us[x] * c, v * c, c, bend[x])
+            ox[x], oy[x], oz[x] = normal

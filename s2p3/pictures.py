@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ from dataset.errors import ToolkitError
 from dataset.frames import Mosaic
 from dataset.pictures import Picture, angle, degree, intensity, nominal_camera_matrix, to_bytes
 from dataset.polarimetry import Raw, Stokes, decode
-from s2p3.physics import shape_priors
+from s2p3.physics import check_index, shape_priors
 from s2p3.rendering.rasterizer import Raster
 
 CONTOUR_BGR = (80, 220, 255)
@@ -61,10 +60,7 @@ def decode_picture(raw: Path, layout: Mosaic, out: Path, index: float) -> list[P
         ToolkitError: no such image, not a mosaic of this layout, or an impossible index.
     """
     pixels = _read_mosaic(raw)
-    if not 1 < index < math.inf:
-        raise ToolkitError(
-            f"--index {index:g} is not a refractive index of something in air; give a number above 1"
-        )
+    check_index(index)
     stokes = decode(pixels, layout, bits=_significant_bits(pixels))
     priors = prior_normals(stokes, nominal_camera_matrix(*stokes.shape), index)
     pictures = {"s0": intensity(stokes), "dolp": degree(stokes), "aolp": angle(stokes)} | {

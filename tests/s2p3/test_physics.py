@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from dataset import ToolkitError
 from s2p3 import physics
 
 INDICES = [1.35, 1.5, 1.52, 2.0, 2.75]
@@ -212,3 +213,14 @@ def test_compiled_priors_of_strided_and_dark_images() -> None:
     fast = physics.shape_priors(strided, 1.5, K.float().expand(2, 3, 3))
     exact = physics.shape_priors_reference(stokes.double(), 1.5, K.expand(2, 3, 3))
     torch.testing.assert_close(fast, exact.float(), atol=2e-6, rtol=0)
+
+
+def test_priors_of_no_images_are_none_and_of_other_shapes_an_error() -> None:
+    assert physics.shape_priors(torch.zeros(0, 3, 4, 5), 1.5, torch.zeros(0, 3, 3)).shape == (0, 9, 4, 5)
+    half = torch.rand(1, 3, 4, 5).bfloat16()
+    assert torch.isfinite(physics.shape_priors(half, 1.5, K.bfloat16())).all()
+    for stokes, cameras in ((torch.zeros(2, 3, 4, 5), K), (torch.zeros(1, 4, 4, 5), K)):
+        with pytest.raises(ToolkitError, match=r"\(B, 3, H, W\)"):
+            physics.shape_priors(stokes, 1.5, cameras)
+    with pytest.raises(ToolkitError, match="refractive index"):
+        physics.shape_priors(torch.zeros(1, 3, 4, 5), 1.0, K)

@@ -40,14 +40,14 @@ class Timing:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--object", default="cup", choices=objects.NAMES)
-    parser.add_argument("--frames", type=int, default=16, help="per number of workers, at least 8")
+    parser.add_argument("--frames", type=int, default=16, help="per number of workers, at least 4")
     parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     backend = PathTraced.here(options.samples)
     recipe = Recipe(objects.build(options.object), session_camera(), SYNTHETIC, backend, options.seed)
-    one, two = (timed(recipe, max(options.frames, 8), workers) for workers in (1, 2))
+    one, two = (timed(recipe, max(options.frames, 4), workers) for workers in (1, 2))
     speedup = one.wall_s_per_set / two.wall_s_per_set
     result = {
         "object": options.object,

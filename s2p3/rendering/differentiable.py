@@ -21,14 +21,18 @@ On the CPU all of it runs in hand-differentiated kernels; `render_reference` is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import fields
+
 import torch
 from torch import Tensor
 
+from dataset import ToolkitError
 from s2p3.rendering.cpu_kernels import CpuRender
 from s2p3.rendering.reference import DEPTH_STEP, render_reference
 from s2p3.rendering.render_mesh import RenderMesh, RenderOutput
 
-__all__ = ["DEPTH_STEP", "RenderMesh", "RenderOutput", "render", "render_reference"]
+__all__ = ["DEPTH_STEP", "RenderMesh", "RenderOutput", "render", "render_each", "render_reference"]
 
 
 def render(
@@ -43,10 +47,49 @@ def render(
 
     Computes in float32 (float64 where R is), under autocast too. Faces nearer than 1 mm are not drawn; an
     object out of sight gives zeros and zero gradients.
+
+    Raises:
+        ToolkitError: other shapes.
     """
+    batch = len(R)
+    if R.shape != (batch, 3, 3) or t.shape != (batch, 3) or K.shape != (batch, 3, 3):
+        raise ToolkitError(
+            f"render: R, t and K must be (B, 3, 3), (B, 3), (B, 3, 3), got "
+            f"{tuple(R.shape)}, {tuple(t.shape)}, {tuple(K.shape)}"
+        )
+    K = K.detach()
     if R.device.type != "cpu":
         return render_reference(mesh, R, t, K, height, width, silhouette)
     dtype = torch.float64 if R.dtype == torch.float64 else torch.float32
     step = DEPTH_STEP if silhouette else float("inf")
     outputs = CpuRender.apply(R.to(dtype), t.to(dtype), K.to(dtype), mesh.arrays(), (height, width), step)
     return RenderOutput(*outputs)
+
+
+def render_each(
+    meshes: Sequence[RenderMesh],
+    R: Tensor,
+    t: Tensor,
+    K: Tensor,
+    height: int,
+    width: int,
+    silhouette: bool = True,
+) -> RenderOutput:
+    """`render` of B objects, each at its own pose: `meshes` holds one for every pose, the same one again
+    where an object occurs again.
+
+    Raises:
+        ToolkitError: other shapes, or not as many meshes as poses.
+    """
+    if not len(meshes) == len(R) > 0:
+        raise ToolkitError(f"render_each: {len(meshes)} meshes at {len(R)} poses; give one for each")
+    places: dict[int, list[int]] = {}
+    for place, mesh in enumerate(meshes):
+        places.setdefault(id(mesh), []).append(place)
+    parts = [
+        render(meshes[own[0]], R[own], t[own], K[own], height, width, silhouette) for own in places.values()
+    ]
+    order = torch.tensor([place for own in places.values() for place in own], device=R.device).argsort()
+    return RenderOutput(
+        *(torch.cat([getattr(part, field.name) for part in parts])[order] for field in fields(RenderOutput))
+    )

@@ -8,10 +8,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dataset import SE3, Intrinsics
+from dataset import SE3, Intrinsics, ToolkitError
 from s2p3 import object_meshes, objects
 from s2p3.rendering import Mesh, rasterize
-from s2p3.rendering.differentiable import RenderMesh, render, render_reference
+from s2p3.rendering.differentiable import RenderMesh, render, render_each, render_reference
 
 SIZE = 128
 
@@ -249,3 +249,43 @@ def test_a_batch_is_its_images_and_autocast_stays_in_float32() -> None:
     assert single.normals.dtype == torch.float32
     torch.testing.assert_close(single.nocs[0], batch.nocs[1])
     torch.testing.assert_close(single.normals[0], batch.normals[1])
+
+
+def test_a_batch_of_objects_is_each_of_them_with_its_gradients() -> None:
+    cup, fork = (RenderMesh.from_mesh(objects.build(name).mesh) for name in ("cup", "fork"))
+    R, t, K = _views(objects.build("cup"), 4, seed=9)
+    weight = torch.randn(4, 8, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+    order = [cup, fork, cup, fork]
+    results = []
+    for separately in (False, True):
+        pose = R.clone().requires_grad_(), t.clone().requires_grad_()
+        if separately:
+            single = [
+                render(mesh, pose[0][[i]], pose[1][[i]], K[[i]], SIZE, SIZE) for i, mesh in enumerate(order)
+            ]
+            maps = torch.cat([torch.cat([o.mask, o.normals, o.depth, o.nocs], dim=1) for o in single])
+        else:
+            o = render_each(order, *pose, K, SIZE, SIZE)
+            maps = torch.cat([o.mask, o.normals, o.depth, o.nocs], dim=1)
+        results.append((maps.detach(), *torch.autograd.grad((maps * weight).sum(), pose)))
+    for together, apart in zip(*results, strict=True):
+        torch.testing.assert_close(together, apart)
+    with pytest.raises(ToolkitError, match="3 meshes at 4 poses"):
+        render_each(order[:3], R, t, K, SIZE, SIZE)
+
+
+def test_poses_and_cameras_that_do_not_belong_together_are_refused() -> None:
+    mesh = RenderMesh.from_mesh(objects.build("cup").mesh)
+    R, t, K = _views(objects.build("cup"), 2, seed=1)
+    for wrong in ((R, t, K[:1]), (R[:1], t, K), (R, t[0], K)):
+        with pytest.raises(ToolkitError, match="must be"):
+            render(mesh, *wrong, SIZE, SIZE)
+    render(mesh, R, t, K.requires_grad_(), SIZE, SIZE).mask.sum()  # no gradient to the camera, no error
+
+
+@pytest.mark.parametrize("function", [render, render_reference])
+def test_a_pose_that_is_no_number_shows_nothing(function: type(render)) -> None:
+    mesh = RenderMesh.from_mesh(objects.build("cup").mesh)
+    R, t, K = _views(objects.build("cup"), 1, seed=1)
+    assert not function(mesh, R, t * torch.nan, K, SIZE, SIZE).mask.any()
+    assert not function(mesh, R * torch.nan, t, K, SIZE, SIZE).mask.any()

@@ -48,7 +48,7 @@ def fuse_poses(poses: SE3, covariances: ArrayLike, symmetry_axis: ArrayLike | No
     """
     variances = np.asarray(covariances, np.float64)
     if symmetry_axis is not None:
-        poses = _turned_alike(poses, np.asarray(symmetry_axis, np.float64))
+        poses = turned_alike(poses, poses[0], symmetry_axis)
     information = np.linalg.inv(variances)
     total = information.sum(axis=0)
     mean = poses[0]
@@ -68,13 +68,11 @@ def fuse_poses(poses: SE3, covariances: ArrayLike, symmetry_axis: ArrayLike | No
     return FusedPose(mean, np.linalg.inv(total), apart_m, apart_rad)
 
 
-def _turned_alike(poses: SE3, axis: Floats) -> SE3:
-    """The poses turned about the object's axis so that each is as close to the first as can be."""
+def turned_alike(poses: SE3, reference: SE3, symmetry_axis: ArrayLike) -> SE3:
+    """N poses turned about the object's axis so that each is as close to a reference as can be."""
+    axis = np.asarray(symmetry_axis, np.float64)
     axis = axis / np.linalg.norm(axis)
-    turned = []
-    for pose in poses:
-        # The twist about the axis of a rotation (swing-twist decomposition of its quaternion).
-        x, y, z, w = (pose.inverse() @ poses[0]).as_quaternion()
-        angle = 2 * np.arctan2(axis @ [x, y, z], w)
-        turned.append(pose @ SE3.from_rotvec(angle * axis, np.zeros(3)))
-    return SE3.stack(turned)
+    # The twist about the axis of a rotation (swing-twist decomposition of its quaternion).
+    quaternion = (poses.inverse() @ reference).as_quaternion()
+    angle = 2 * np.arctan2(quaternion[:, :3] @ axis, quaternion[:, 3])
+    return poses @ SE3.from_rotvec(angle[:, None] * axis, np.zeros(3))

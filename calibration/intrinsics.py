@@ -100,7 +100,7 @@ def calibrate_intrinsics(
     view_rms = observations.view_rms(solution.residual)
     # A view is an outlier when it fits several times worse than the others: motion blur, a bent board, a
     # wrong focus.
-    limit = 3.0 * np.median(view_rms) + 0.02
+    limit = 3.0 * np.median(view_rms) + 0.05
     if (view_rms > limit).any() and np.count_nonzero(view_rms <= limit) >= MIN_VIEWS:
         used = view_rms <= limit
         kept = observations.of_views(used)

@@ -16,6 +16,7 @@ Floats = NDArray[np.float64]
 _TURN_STEPS = 12
 _SAME_FIT = 2.0
 _TURN_SLIP_RAD = np.radians(4.0)
+_SAME_TURN_RAD = np.radians(12.0)
 _UNOBSERVABLE_RAD = np.radians(3.0)
 _UNOBSERVABLE_M = 5e-3
 _OPEN = 0.5
@@ -118,6 +119,15 @@ def turns_that_fit(
     return degrees[fits], turn
 
 
+def _known(angles_deg: Floats, turn: Floats, symmetry_turns: SE3 | None) -> NDArray[np.bool_]:
+    """(K,) whether the object turned so far about an axis is one of its symmetries, or nearly."""
+    turned = SE3.exp(np.radians(angles_deg)[:, None] * turn)
+    known = np.zeros(len(angles_deg), bool)
+    for symmetry in () if symmetry_turns is None else symmetry_turns:
+        known |= np.linalg.norm((symmetry.inverse() @ turned).as_rotvec(), axis=1) < _SAME_TURN_RAD
+    return known
+
+
 def _pure_turn(twist: Floats) -> Floats:
     """The twist without its sliding along its own axis."""
     axis = twist[3:] / np.linalg.norm(twist[3:])
@@ -125,7 +135,12 @@ def _pure_turn(twist: Floats) -> Floats:
 
 
 def describe(
-    found: Openness, turn: Floats, ambiguity: Floats, symmetry_axis: Floats | None, radius: float
+    found: Openness,
+    turn: Floats,
+    ambiguity: Floats,
+    symmetry_axis: Floats | None,
+    symmetry_turns: SE3 | None,
+    radius: float,
 ) -> tuple[Floats, tuple[str, ...]]:
     """Words for what is not determined, and the covariance with a full turn's variance where that is open.
 
@@ -133,6 +148,7 @@ def describe(
         found: the fit's.
         turn, ambiguity: of `turns_that_fit`.
         symmetry_axis: of a body of revolution: a turn about it is no defect of the points.
+        symmetry_turns: n other motions that leave the object looking the same.
         radius: of the object.
     """
     covariance = found.covariance
@@ -144,9 +160,12 @@ def describe(
         known = symmetry_axis is not None and abs(axis @ symmetry_axis) > 0.98 * np.linalg.norm(symmetry_axis)
         if not known:
             words.append(f"rotation about the object's {axis_name(axis)} axis (every turn fits the points)")
-    elif len(ambiguity) and np.any((ambiguity > 30) & (ambiguity < 330)):
-        turns = ", ".join(f"{a:.0f}" for a in ambiguity[(ambiguity > 30) & (ambiguity < 330)][:6])
-        words.append(f"turns of {turns} degrees about the object's {axis_name(axis)} axis fit the points too")
+    else:
+        unlike = ambiguity[(ambiguity > 30) & (ambiguity < 330) & ~_known(ambiguity, turn, symmetry_turns)]
+        if len(unlike):
+            turns = ", ".join(f"{angle:.0f}" for angle in unlike[:6])
+            about = axis_name(axis)
+            words.append(f"turns of {turns} degrees about the object's {about} axis fit the points too")
     turn_variance, turn_axes = np.linalg.eigh(found.covariance[3:, 3:])
     for variance, about in zip(turn_variance, turn_axes.T, strict=True):
         if variance > _UNOBSERVABLE_RAD**2 and not (rolled and abs(about @ axis) > 0.9):

@@ -9,8 +9,10 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from calibration.fusion import turned_alike
 from calibration.object_observability import Tip, describe, openness, turns_that_fit
 from calibration.surface_fit import Surface, coarse_fit, finest_fit
+from calibration.words import axis_name
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3
 
@@ -24,6 +26,8 @@ _NOISE_FLOOR_M = 1e-4  # touching is no better than this (our choice); keeps a p
 _BAD_FIT_M = 5e-3
 _DOUBTFUL_FIT_M = 1.5e-3
 """From here on it is worth asking whether the mirror image fits better (our choice)."""
+_AS_GOOD = 1.25
+"""A rival whose residual is no more than that many times the best's fits as well (our choice)."""
 _SMALLEST_SHARE = 0.02
 """Of the mesh's size: points that span less were touched on something smaller."""
 
@@ -42,8 +46,8 @@ class ObjectPoseResult:
         unobservable: what the points leave open, in words; empty when the pose is determined.
         ambiguity_deg: angles by which the object can be turned about the weakest axis without contradicting
             the points (a discrete or continuous symmetry); empty when there are none.
-        runner_up_rms_m: the best fit of a clearly different pose; close to rms_m means the points do not
-            tell them apart.
+        runner_up_rms_m: the best fit of a clearly different pose that is no symmetry of the object; close
+            to rms_m means the points do not tell them apart.
     """
 
     T_base_obj: SE3
@@ -63,6 +67,7 @@ def register_points(
     init: SE3 | None = None,
     symmetry_axis: ArrayLike | None = None,
     tip: Tip | None = None,
+    symmetry_turns: SE3 | None = None,
     seed: int = 0,
 ) -> ObjectPoseResult:
     """Fit a mesh to touched points: many starts, point-to-plane ICP (Chen and Medioni 1992), the best
@@ -75,6 +80,8 @@ def register_points(
         symmetry_axis: (3,) direction about which the object may be turned freely, if it has one: the turn
             about it is then not reported as a defect of the points.
         tip: its ball's radius, and how well it is known; a point known exactly when None.
+        symmetry_turns: n rigid motions in the object's frame that leave it looking the same, reported no
+            more than that turn.
         seed: of the starts.
 
     Raises:
@@ -101,7 +108,11 @@ def register_points(
     found = openness(in_obj, normals, pose, noise, freedom, surface, tip)
     ambiguity, turn = turns_that_fit(points, surface, pose, found.weak, noise)
     known_axis = None if symmetry_axis is None else np.asarray(symmetry_axis, np.float64)
-    covariance, unobservable = describe(found, turn, ambiguity, known_axis, surface.radius)
+    covariance, unobservable = describe(found, turn, ambiguity, known_axis, symmetry_turns, surface.radius)
+    alike = coarse if known_axis is None else turned_alike(coarse, pose, known_axis)
+    rival, rival_rms = _rival(alike, coarse_rms, pose, symmetry_turns, surface.radius)
+    if len(ambiguity) == 0 and rival_rms < _AS_GOOD * max(float(coarse_rms.min()), _NOISE_FLOOR_M):
+        unobservable = (*unobservable, _as_good(pose.inverse() @ rival))
     return ObjectPoseResult(
         T_base_obj=pose,
         covariance=covariance,
@@ -110,7 +121,7 @@ def register_points(
         distance_m=signed,
         unobservable=unobservable,
         ambiguity_deg=ambiguity,
-        runner_up_rms_m=_runner_up(coarse, coarse_rms, pose, surface.radius),
+        runner_up_rms_m=rival_rms,
     )
 
 
@@ -203,11 +214,24 @@ def _starts(points: Floats, surface: Surface, init: SE3 | None, seed: int) -> SE
     return SE3(rotation, centre - rotation @ surface.centre)
 
 
-def _runner_up(poses: SE3, rms: Floats, best: SE3, radius: float) -> float:
-    """The smallest residual among starts that ended clearly elsewhere (15 degrees or a quarter of the
-    object)."""
-    apart = best.inverse() @ poses
-    elsewhere = (np.linalg.norm(apart.as_rotvec(), axis=1) > np.radians(15.0)) | (
-        np.linalg.norm(apart.translation, axis=1) > 0.25 * radius
+def _rival(poses: SE3, rms: Floats, best: SE3, turns: SE3 | None, radius: float) -> tuple[SE3, float]:
+    """Of the starts that ended clearly elsewhere (15 degrees or a quarter of the object), symmetries aside,
+    the one with the smallest residual, and that; infinite when there is none."""
+    elsewhere = np.ones(len(poses), bool)
+    for same in [best] if turns is None else [best, *(best @ turns)]:
+        apart = same.inverse() @ poses
+        elsewhere &= (np.linalg.norm(apart.as_rotvec(), axis=1) > np.radians(15.0)) | (
+            np.linalg.norm(apart.translation, axis=1) > 0.25 * radius
+        )
+    index = int(np.argmin(np.where(elsewhere, rms, np.inf)))
+    return poses[index], float(rms[index]) if elsewhere.any() else float("inf")
+
+
+def _as_good(apart: SE3) -> str:
+    """What is left open by a rival pose, seen from the best."""
+    turn, shift_mm = apart.as_rotvec(), 1e3 * float(np.linalg.norm(apart.translation))
+    degrees = np.degrees(np.linalg.norm(turn))
+    return (
+        f"which of two poses it is: one turned by {degrees:.0f} degrees about the object's {axis_name(turn)}"
+        f" axis and shifted by {shift_mm:.0f} mm fits as well"
     )
-    return float(rms[elsewhere].min()) if elsewhere.any() else float("inf")

@@ -71,6 +71,7 @@ def add_object(
     calibration: Path,
     symmetry_axis: ArrayLike | None = None,
     tip: KnownTip | None = None,
+    symmetry_turns: SE3 | None = None,
 ) -> ObjectPoseRecord:
     """Estimates an object's pose in the base frame from points touched with the tip.
 
@@ -82,6 +83,7 @@ def add_object(
         calibration: file to add the result to; made when there is none.
         symmetry_axis: (3,) of a body of revolution.
         tip: that touched; as calibrated when None. A file of points needs none.
+        symmetry_turns: n other motions that leave the object looking the same.
 
     Raises:
         CalibrationError: as `register_points` and `fuse_poses`, or the tip is not known.
@@ -89,11 +91,11 @@ def add_object(
     """
     paths = [touches] if isinstance(touches, Path) else list(touches)
     found = [_read(path, calibration, tip) for path in paths]
-    first = register_points(found[0].points, vertices, faces, None, symmetry_axis, found[0].tip)
-    results = [first]
-    for t in found[1:]:
+    results: list[ObjectPoseResult] = []
+    for t in found:
         # From where the first found it: of the poses that an object's symmetry makes equal, the same one.
-        results.append(register_points(t.points, vertices, faces, first.T_base_obj, symmetry_axis, t.tip))
+        init = results[0].T_base_obj if results else None
+        results.append(register_points(t.points, vertices, faces, init, symmetry_axis, t.tip, symmetry_turns))
     sources = tuple(Source.of(path) for path in paths)
     record = _fused(results, sources, symmetry_axis)
     _known(calibration).merged(Calibration(objects={name: record})).save(calibration)

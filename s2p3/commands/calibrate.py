@@ -232,6 +232,7 @@ def object_pose(
     from calibration.touch_steps import add_object, known_tip
     from calibration.touches import KnownTip
     from dataset.errors import ToolkitError
+    from dataset.transforms import SE3
     from s2p3.objects import named_object
 
     if not touches:
@@ -241,9 +242,13 @@ def object_pose(
     tip = KnownTip.exactly((0.0, 0.0, 0.0), ball_radius)  # a file of points was measured with it already
     if any(path.suffix in (".h5", ".hdf5") for path in touches):
         tip = known_tip(calibration, guess, ball_radius)
-    done = add_object(touches, model.name, model.vertices, model.faces, calibration, model.symmetry.axis, tip)
-    blind = f"; not observable: {', '.join(done.unobservable)}" if done.unobservable else ""
-    say(f"{object} from {done.points} points: {1e3 * done.rms_m:.3f} mm from the surface{blind}")
+    symmetry = model.symmetry
+    turns = SE3.from_matrix(symmetry.transforms) if len(symmetry.transforms) else None
+    done = add_object(
+        touches, model.name, model.vertices, model.faces, calibration, symmetry.axis, tip, turns
+    )
+    say(f"{object} from {done.points} points: {1e3 * done.rms_m:.3f} mm from the surface")
+    _warn(tuple(f"the points leave open: {words}" for words in done.unobservable))
     _apply(calibration, apply)
 
 

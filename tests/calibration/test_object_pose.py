@@ -79,6 +79,20 @@ def test_a_known_symmetry_is_not_reported_as_a_defect():
     result = register_points(_touch(cup, 24, 0), cup.vertices, cup.faces, symmetry_axis=[0, 0, 1])
     assert result.unobservable == ()
     assert np.sqrt(result.covariance[5, 5]) > 1.0
+    assert result.runner_up_rms_m > 2 * result.rms_m
+
+
+def test_known_turns_are_no_defect_nor_a_rival():
+    box = trimesh.creation.box([0.06, 0.08, 0.1])
+    points = _touch(box, 30, 0)
+    halves = SE3.from_rotvec(np.pi * np.eye(3), np.zeros(3))
+    told = register_points(points, box.vertices, box.faces)
+    known = register_points(points, box.vertices, box.faces, symmetry_turns=halves)
+    (words,) = told.unobservable
+    assert "turned by 180 degrees" in words
+    assert told.runner_up_rms_m < 2 * told.rms_m
+    assert known.unobservable == ()
+    assert known.runner_up_rms_m > 2 * known.rms_m
 
 
 def test_a_box_touched_on_two_sides_only_does_not_know_its_height():

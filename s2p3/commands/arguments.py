@@ -18,6 +18,9 @@ OptionalNumber = Annotated[float | None, tyro.conf.arg(metavar="NUMBER", help_be
 ObjectName = Annotated[str, tyro.conf.arg(metavar="NAME")]
 """Of a built-in object, or of the one in --mesh."""
 
+ObjectNames = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")]
+"""Of one object or more."""
+
 RequiredName = Annotated[str, tyro.conf.arg(metavar="NAME", help_behavior_hint="(required)")]
 RequiredPath = Annotated[Path, tyro.conf.arg(metavar="PATH", help_behavior_hint="(required)")]
 """Asked for by the verb itself, because with --describe they are not needed."""

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from dataset.errors import ToolkitError
 from s2p3.commands.arguments import (
     ObjectName,
+    ObjectNames,
     OptionalPath,
     RequiredName,
     RequiredPath,
@@ -42,7 +44,7 @@ _SELF_SUPERVISION = SelfSupervisionPart()
 def train_detector(
     sessions: Sessions,
     *,
-    object: ObjectName,
+    object: ObjectNames,
     out: Path,
     mesh: OptionalPath = None,
     preset: Preset = "fast",
@@ -51,11 +53,11 @@ def train_detector(
     workers: int = 1,
     experiment: DetectorFields = _DETECTOR,
 ) -> None:
-    """Train the detector: the object's mask and box in the whole image.
+    """Train the detector: masks and boxes of one object, or of several, in the whole image.
 
     Args:
-        sessions: files with poses and masks of the object, usually synthetic.
-        object: cup, fork, knife, bottle, or the name of the object in --mesh.
+        sessions: files with poses and masks of the objects, usually synthetic; each shows one at least.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh; a class each.
         out: folder for detector.safetensors and the log; an interrupted training continues.
         mesh: PLY, OBJ or STL of the object, metres.
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
@@ -68,7 +70,10 @@ def train_detector(
 
     _use(threads, workers)
     chosen = experiment.within(experiment_of(preset, config))
-    say(str(train(_some(sessions), named_object(object, mesh), chosen, out, workers=workers)))
+    if mesh is not None and len(object) > 1:
+        raise ToolkitError("--mesh is of one object; train a detector of several with built-in ones")
+    models = [named_object(name, mesh) for name in object]
+    say(str(train(_some(sessions), models, chosen, out, workers=workers)))
 
 
 def train_teacher(
@@ -193,8 +198,6 @@ def train_self_supervised(
 
 
 def _some(sessions: list[Path]) -> list[Path]:
-    from dataset.errors import ToolkitError
-
     if not sessions:
         raise ToolkitError("no session to train on; name one or more, made with: s2p3 synthesize")
     return sessions
@@ -208,8 +211,6 @@ def _describe(kind: Literal["teacher", "student"], experiment: ExperimentConfig,
 
 def _all_given(**values: str | Path) -> None:
     """Raises ToolkitError: an option that a training needs is missing."""
-    from dataset.errors import ToolkitError
-
     missing = [f"--{name}" for name, value in values.items() if value in ("", Path())]
     if missing:
         raise ToolkitError(

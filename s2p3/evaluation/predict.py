@@ -48,24 +48,32 @@ class PoseEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Finder:
-    """A trained detector with its settings: Stokes image to `Detection`."""
+    """A trained detector with its settings: Stokes image to `Detection` of one of its objects."""
 
     network: DetectorNetwork
     settings: DetectorConfig
+    class_index: int = 0
 
     @staticmethod
     def load(path: Path, object_name: str | None = None) -> Finder:
-        """Reads a checkpoint, or the ONNX file of one. Raises ToolkitError as `checkpoint.read_info`."""
+        """Reads a checkpoint, or the ONNX file of one; without a name it finds the detector's first object.
+
+        Raises ToolkitError as `checkpoint.read_info`.
+        """
+        network: DetectorNetwork
         if path.suffix == ".onnx":
             info = checkpoint.read_info(path, "detector", object_name)
-            return Finder(cast(DetectorNetwork, _exported(path)), info.config.detector)
-        network, info = load_detector(path, object_name)
-        return Finder(network, info.config.detector)
+            network = cast(DetectorNetwork, _exported(path))
+        else:
+            network, info = load_detector(path, object_name)
+        index = 0 if object_name is None else info.names.index(object_name)
+        return Finder(network, info.config.detector, index)
 
     def __call__(self, stokes: NDArray[np.float32]) -> Detection | None:
         """`stokes` (3, H, W), undistorted."""
         settings = self.settings
-        return detect(self.network, stokes, settings.level, settings.threshold, settings.minimum_score)
+        limits = (settings.level, settings.threshold, settings.minimum_score)
+        return detect(self.network, stokes, *limits, self.class_index)
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,7 +47,8 @@ class Detection:
 
 
 class Detector(nn.Module):
-    """Lite0 blocks 0-10 with a decoder back to stride 2, one mask per class and four distances per cell."""
+    """Lite0 blocks 0-10 with a decoder back to stride 2, one mask per class and four distances per cell, to
+    the box of the class that the cell shows."""
 
     def __init__(self, classes: int = 1, imagenet: bool = True) -> None:
         super().__init__()
@@ -109,6 +110,7 @@ def detect(
     Args:
         stokes: (3, H, W).
         level, threshold, minimum_score: see `s2p3.config.DetectorConfig`.
+        class_index: of the object, in the order the detector was trained for.
 
     Returns None where nothing is found.
     """

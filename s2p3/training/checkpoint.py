@@ -46,12 +46,14 @@ class CheckpointInfo:
     Attributes:
         kind: of network.
         stage: "pretrained" or "self-supervised".
-        object_name, diameter_m, refractive_index: of the object it was trained for.
+        object_name, diameter_m, refractive_index: of the object it was trained for; of a detector of several,
+            of the first.
         step: optimizer steps after which the weights were these.
         config: the whole experiment.
         data: hashes of what it was trained on, by session id.
         commit: of the toolkit.
         validation: None where the last weights were kept.
+        classes: of a detector, its objects in the order of its masks.
     """
 
     kind: Kind
@@ -64,6 +66,12 @@ class CheckpointInfo:
     data: dict[str, str]
     commit: str = "unknown"
     validation: Validation | None = None
+    classes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all objects it was trained for."""
+        return self.classes or (self.object_name,)
 
     @staticmethod
     def of(
@@ -149,14 +157,15 @@ def read_info(path: Path, kind: Kind | None = None, object_name: str | None = No
         config = typed_toml.loads(ExperimentConfig, values.pop("config"), source=str(description))
         validation = values.pop("validation", None)
         validation = None if validation is None else Validation(**validation)
-        info = CheckpointInfo(config=config, validation=validation, **values)
+        classes = tuple(values.pop("classes", ()))
+        info = CheckpointInfo(config=config, validation=validation, classes=classes, **values)
     except (TypeError, KeyError) as error:
         raise ToolkitError(f"{description}: fields missing or unknown ({error}); train again") from error
     if kind is not None and info.kind != kind:
         raise ToolkitError(f"{path}: holds a {info.kind}, not a {kind}; give the {kind}'s checkpoint")
-    if object_name is not None and info.object_name != object_name:
+    if object_name is not None and object_name not in info.names:
         raise ToolkitError(
-            f"{path}: was trained for {info.object_name!r}, not {object_name!r}; "
+            f"{path}: was trained for {', '.join(map(repr, info.names))}, not {object_name!r}; "
             f"train a {info.kind} for {object_name!r}"
         )
     return info

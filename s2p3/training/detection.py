@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -44,7 +43,7 @@ class SmallFrames:
 
     Attributes:
         stokes: (N, 3, h, w) float16.
-        masks: (N, classes, h, w) float16, 0 to 1.
+        masks: (N, classes, h, w) float16, 0 to 1; a session that lacks an object shows nothing of it.
     """
 
     stokes: Tensor
@@ -59,20 +58,30 @@ class SmallFrames:
 
 
 def small_frames(
-    paths: Sequence[Path], object_name: str, level: int, on_step: OnStep | None = None
+    paths: Sequence[Path], names: Sequence[str], level: int, on_step: OnStep | None = None
 ) -> SmallFrames:
-    """Every frame of `paths`, down-sampled by `level`, with the object's visible mask as the only class."""
-    stokes, masks = [], []
-    with reporting(f"frames with {object_name}", 1, on_step) as report:
+    """Every frame of `paths`, down-sampled by `level`, with a class for the visible mask of each object.
+
+    Raises ToolkitError: no frames; a session that shows none of the objects, an object that is in none.
+    """
+    stokes, masks, found = [], [], set[str]()
+    with reporting(f"frames with {', '.join(names)}", 1, on_step) as report:
         for path in paths:
             with Session.open(path) as session:
-                poses = session.object_poses(object_name)
+                here = [name for name in names if session.contents.has(f"poses/objects/{name}")]
+                # a session without any of them says itself what it lacks
+                poses = {name: session.object_poses(name) for name in here or names[:1]}
+                found |= set(here)
                 for index in range(len(session)):
                     image = torch.from_numpy(session.stokes(index).stack())
-                    mask = torch.from_numpy(poses.mask(index).astype(np.float32))[None]
+                    mask = torch.zeros(len(names), *image.shape[1:])
+                    for name, one in poses.items():
+                        mask[names.index(name)] = torch.from_numpy(one.mask(index))
                     stokes.append(downsample(image[None], level)[0].half())
                     masks.append(downsample(mask[None], level)[0].half())
                     report(index + 1, len(session), {})
+    if missing := [name for name in names if name not in found]:
+        raise ToolkitError(f"no session shows {', '.join(missing)}; synthesize some that do, or leave it out")
     if not stokes:
         raise ToolkitError(f"{', '.join(map(str, paths))}: no frames; synthesize or record some first")
     return SmallFrames(torch.stack(stokes), torch.stack(masks))
@@ -80,24 +89,26 @@ def small_frames(
 
 def train_detector(
     sessions: Sequence[Path],
-    model: ObjectModel,
+    models: ObjectModel | Sequence[ObjectModel],
     config: ExperimentConfig,
     out: Path,
     on_step: OnStep | None = None,
     workers: int = 0,
 ) -> Path:
-    """Trains a detector of `model` and writes `out`/detector.safetensors, which is returned.
+    """Trains a detector of one object or several and writes `out`/detector.safetensors, which is returned.
 
     Args:
-        sessions: with poses and masks of the object, usually synthetic.
+        sessions: with poses and masks of the objects, usually synthetic; each shows one of them at least.
+        models: a class each, in this order.
         on_step, workers: see `loop.optimize`.
 
-    Raises ToolkitError: a session lacks the object; see also `loop.optimize`.
+    Raises ToolkitError: a session shows none of the objects; see also `loop.optimize`.
     """
-    settings = config.detector
+    models = [models] if isinstance(models, ObjectModel) else list(models)
+    names, settings = [model.name for model in models], config.detector
     path = out / "detector.safetensors"
-    hashes = content_hashes(sessions, model)
-    frames = small_frames(sessions, model.name, settings.level)
+    frames = small_frames(sessions, names, settings.level)
+    hashes = _hashes(sessions, models)
     order = torch.randperm(len(frames), generator=torch.Generator().manual_seed(settings.seed))
     count = min(int(settings.holdout * len(frames)), MOST_HELD_OUT) if settings.validations else 0
     data, score = FrameData(frames, order[count:].sort().values), None
@@ -111,7 +122,7 @@ def train_detector(
         detector_objective,
         settings,
         path,
-        f"{hashes} {model.name}",
+        f"{hashes} {names}",
         "detector",
         score=score,
         workers=workers,
@@ -120,8 +131,8 @@ def train_detector(
     validation = None
     if score is not None and trained.score is not None:
         validation = Validation(score.name, trained.score, f"{count} of {len(frames)} frames")
-    info = CheckpointInfo.of("detector", "pretrained", model, trained.step, config, hashes, validation)
-    checkpoint.save(path, trained.network.state_dict(), info)
+    info = CheckpointInfo.of("detector", "pretrained", models[0], trained.step, config, hashes, validation)
+    checkpoint.save(path, trained.network.state_dict(), replace(info, classes=tuple(names)))
     return path
 
 
@@ -170,8 +181,20 @@ class MaskScorer:
 def load_detector(path: Path, object_name: str | None = None) -> tuple[Detector, CheckpointInfo]:
     """Reads a detector. Raises ToolkitError as `checkpoint.read_info` and `checkpoint.load_weights`."""
     info = checkpoint.read_info(path, "detector", object_name)
-    network = checkpoint.load_weights(Detector(imagenet=False), path)
+    network = checkpoint.load_weights(Detector(len(info.names), imagenet=False), path)
     return channels_last(network), info
+
+
+def _hashes(sessions: Sequence[Path], models: Sequence[ObjectModel]) -> dict[str, str]:
+    """The hashes of the sessions, see `content_hashes`, of all the objects that each shows."""
+    hashes: dict[str, str] = {}
+    for path in sessions:
+        with Session.open(path) as session:
+            here = [one for one in models if session.contents.has(f"poses/objects/{one.name}")]
+        for model in here:
+            for session_id, digest in content_hashes([path], model).items():
+                hashes[session_id] = f"{hashes.get(session_id, '')}{digest}"
+    return hashes
 
 
 def detector_losses(logits: Tensor, distances: Tensor, masks: Tensor) -> Losses:
@@ -180,19 +203,20 @@ def detector_losses(logits: Tensor, distances: Tensor, masks: Tensor) -> Losses:
 
     Args:
         logits: (B, classes, h/2, w/2), distances: (B, 4, h/2, w/2), of a possibly padded image.
-        masks: (B, classes, h, w); the box is that of all classes together (one object an image).
+        masks: (B, classes, h, w); a cell's distances are to the box of the class that it shows.
     """
     height, width = logits.shape[2:]
     padded = F.pad(masks, (0, width * CELL - masks.shape[3], 0, height * CELL - masks.shape[2]))
     target = F.avg_pool2d(padded, CELL)
     entropy = F.binary_cross_entropy_with_logits(logits, target)
     probability = logits.sigmoid()
-    overlap = 2 * (probability * target).sum((1, 2, 3)) + 1
-    dice = (1 - overlap / (probability.sum((1, 2, 3)) + target.sum((1, 2, 3)) + 1)).mean()
-    true_distances, side = box_distances(padded.amax(1) > 0.5, (height, width))
-    inside = (target.amax(1, keepdim=True) > 0.5).float()
-    error = (distances - true_distances).abs().mean(1, keepdim=True) / side[:, None, None, None]
-    box = (error * inside).sum() / (inside.sum() + 1)
+    overlap = 2 * (probability * target).sum((2, 3)) + 1
+    dice = (1 - overlap / (probability.sum((2, 3)) + target.sum((2, 3)) + 1)).mean()
+    inside, errors = (target > 0.5).float(), []
+    for shown in padded.unbind(1):
+        true_distances, side = box_distances(shown > 0.5, (height, width))
+        errors.append((distances - true_distances).abs().mean(1) / side[:, None, None])
+    box = (torch.stack(errors, dim=1) * inside).sum() / (inside.sum() + 1)
     return {"total": 4 * entropy + dice + 5 * box, "entropy": entropy, "dice": dice, "box": box}
 
 

@@ -22,6 +22,7 @@ class Processes:
     """This process among those that `accelerate launch` or `torchrun` started; alone where neither did."""
 
     accelerator: Accelerator
+    half_precision: bool = False
 
     @staticmethod
     def start() -> Processes:
@@ -37,8 +38,10 @@ class Processes:
             raise ToolkitError(
                 f"training needs the package accelerate ({error}); install it with: pip install 's2p3[train]'"
             ) from error
-        half = torch.cuda.is_available() and torch.cuda.is_bf16_supported(including_emulation=False)
-        return Processes(Accelerator(mixed_precision="bf16" if half else "no"))
+        gpu = torch.cuda.is_available()
+        half = gpu and torch.cuda.is_bf16_supported(including_emulation=False)
+        # left to itself, accelerate does not meet other processes without a GPU
+        return Processes(Accelerator(cpu=not gpu, mixed_precision="no"), half)
 
     @property
     def device(self) -> torch.device:
@@ -61,12 +64,14 @@ class Processes:
         return "" if self.first else f"-{self.accelerator.process_index}"
 
     def prepare(self, network: nn.Module) -> Callable[..., Any]:
-        """The network as a function whose gradients are averaged over all processes. It may compute in half
-        precision; what it returns is float32, and so is everything that is made of it."""
+        """The network as a function whose gradients are averaged over all processes. It computes in half
+        precision where that is on; what it returns is float32, and so is all that is made of it."""
         prepared = self.accelerator.prepare_model(network)
 
         def forward(*inputs: torch.Tensor) -> Any:
-            return map_tensors(prepared(*inputs), torch.Tensor.float)
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half_precision):
+                output = prepared(*inputs)
+            return map_tensors(output, torch.Tensor.float)
 
         return forward
 

@@ -18,7 +18,7 @@ from dataset import SE3
 from dataset.errors import ToolkitError
 from dataset.session import Session, mask_box
 from s2p3 import config as presets
-from s2p3.config import AugmentationConfig, ExperimentConfig, StageConfig
+from s2p3.config import AugmentationConfig, ExperimentConfig
 from s2p3.inputs import View
 from s2p3.networks.detector import Detection
 from s2p3.networks.teacher import Teacher
@@ -30,7 +30,6 @@ from s2p3.training import (
     captured_crops,
     checkpoint,
     labelled_crops,
-    loop,
     self_supervise,
     train_detector,
     train_student,
@@ -196,17 +195,6 @@ def test_a_resume_file_of_other_settings_is_refused(
     other = dataclasses.replace(experiment, student=dataclasses.replace(experiment.student, seed=1))
     with pytest.raises(ToolkitError, match="other settings"):
         train_student([cup_session], cup, other, tmp_path, on_step=silent)
-
-
-def test_learning_rates() -> None:
-    assert loop.rate_factor("halving", 0.0) == 1
-    assert loop.rate_factor("halving", 0.26) == 0.5
-    assert loop.rate_factor("halving", 0.99) == 0.125
-    assert loop.rate_factor("cosine", 0.08) == 1
-    assert loop.rate_factor("cosine", 0.0) < 0.05
-    assert loop.rate_factor("cosine", 0.999) < 0.01
-    assert StageConfig(steps=7, epochs=0, batch=8).steps_over(100) == 7
-    assert StageConfig(steps=7, epochs=3, batch=8).steps_over(100) == 37
 
 
 def test_a_warm_start_takes_the_teachers_encoders(

@@ -140,7 +140,8 @@ class FrameStream:
     Args:
         camera: started.
         ledger: of the session.
-        depth: frames held in memory at most, beside the camera's own buffers.
+        depth: frames held in memory at most, beside the camera's own buffers; by default those of a second at
+            full rate, which is the most that a killed recording loses.
         threads: that compress.
 
     Attributes:

@@ -13,6 +13,7 @@ import inspect
 import io
 import ipaddress
 import re
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -75,8 +76,8 @@ def page_server(address: Address, title: str) -> Iterator[viser.ViserServer]:
     """A viser server at an address, guarded, for the length of a `with` block.
 
     Raises:
-        ToolkitError: viser is not installed or too different from the one this was written for, or the port
-            is taken.
+        ToolkitError: viser is not installed or too different from the one this was written for, the host
+            is no address, or the port is taken.
     """
     try:
         import viser
@@ -84,6 +85,11 @@ def page_server(address: Address, title: str) -> Iterator[viser.ViserServer]:
         raise ToolkitError(
             "pages in the browser need viser, which is not installed; run: pip install 's2p3[console]'"
         ) from error
+
+    try:
+        socket.getaddrinfo(address.host, address.port)  # viser would go on asking for ever
+    except OSError as error:
+        raise ToolkitError(f"--host {address.host} is no address; give one of this computer") from error
 
     class Server(viser.ViserServer):
         """Never opens viser's tunnel to the public internet, which any client may ask for."""

@@ -10,7 +10,6 @@ microseconds, poses as position and quaternion, boxes by their corners, and no c
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,9 +20,8 @@ from numpy.typing import NDArray
 from dataset.compression import checksum
 from dataset.errors import SessionError
 from dataset.schema import FORMAT, MAJOR, VERSION, declaration, declared_at
-from dataset.session.files import LIBVER, attribute, make_dataset, open_hdf5, reading
-from dataset.session.seals import leave_open, seal
-from dataset.subset import check_new
+from dataset.session.files import attribute, check_new, create_whole, make_dataset, open_hdf5, reading
+from dataset.session.seals import leave_open
 from dataset.transforms import SE3
 
 Converter = Callable[[h5py.File, h5py.File], None]
@@ -46,22 +44,16 @@ def convert(path: str | Path, out: str | Path) -> str:
     path, out = Path(path), Path(out)
     check_new(out)
     source, unfinished = open_hdf5(path)
-    partial = out.with_name(out.name + ".partial")
-    try:
-        with source:
-            with reading(path):
-                found, version = attribute(source, "format"), str(attribute(source, "schema"))
-            converter = _converter(path, found, version)
-            if unfinished or not attribute(source, "complete"):
-                raise SessionError(
-                    f"{path} is incomplete; repair it with the toolkit that wrote it, then convert it"
-                )
-            with h5py.File(partial, "w", libver=LIBVER) as target, reading(path, "its content"):
-                converter(source, target)
-                seal(target)
-        os.replace(partial, out)
-    finally:
-        partial.unlink(missing_ok=True)
+    with source:
+        with reading(path):
+            found, version = attribute(source, "format"), str(attribute(source, "schema"))
+        converter = _converter(path, found, version)
+        if unfinished or not attribute(source, "complete"):
+            raise SessionError(
+                f"{path} is incomplete; repair it with the toolkit that wrote it, then convert it"
+            )
+        with create_whole(out, path.stat().st_size) as target, reading(path, "its content"):
+            converter(source, target)
     return version
 
 

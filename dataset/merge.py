@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import uuid
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -21,9 +20,9 @@ from dataset.schema import FRAME_COLUMNS, ROBOT_COLUMNS, SEGMENT_DTYPE, VERSION,
 from dataset.session import Session
 from dataset.session.clock_store import store
 from dataset.session.edit import store_images
-from dataset.session.files import LIBVER, dtype_of, make_dataset, open_for_reading
-from dataset.session.seals import leave_open, seal
-from dataset.subset import check_new, require_complete
+from dataset.session.files import check_new, create_whole, dtype_of, make_dataset, open_for_reading
+from dataset.session.seals import leave_open
+from dataset.subset import require_complete
 
 _SINGLE = ("kind", "rig_toml", "host_boot_id")
 """Attributes of / that the parts share, or that the merged file leaves empty."""
@@ -68,7 +67,7 @@ def merge(paths: Sequence[str | Path], out: str | Path, *, forget_clocks: bool =
         SessionError: fewer than two parts, one is incomplete or damaged, or they differ in something that a
             session has only one of; says in what.
     """
-    paths, out = [Path(path) for path in paths], Path(out)
+    out = Path(out)
     check_new(out)
     if len(paths) < 2:
         raise SessionError("a merge needs at least two sessions; name them all before --out")
@@ -81,14 +80,8 @@ def merge(paths: Sequence[str | Path], out: str | Path, *, forget_clocks: bool =
             sessions = _in_order(sessions)
         files = [stack.enter_context(open_for_reading(session.path)[0]) for session in sessions]
         parts = _placed(sessions, files)
-        partial = out.with_name(out.name + ".partial")
-        try:
-            with h5py.File(partial, "w", libver=LIBVER) as target:
-                _write(target, parts, forget_clocks)
-                seal(target)
-            os.replace(partial, out)
-        finally:
-            partial.unlink(missing_ok=True)
+        with create_whole(out, sum(session.path.stat().st_size for session in sessions)) as target:
+            _write(target, parts, forget_clocks)
     return sum(len(session) for session in sessions)
 
 

@@ -32,9 +32,9 @@ def by_frame(count: int, fractions: Mapping[str, float], seed: int) -> dict[str,
         Increasing frame indices by name; every frame is in exactly one split.
 
     Raises:
-        ToolkitError: fractions are negative or do not sum to 1, or a split would be empty.
+        ToolkitError: fractions or seed are negative, fractions do not sum to 1, or a split would be empty.
     """
-    _check(fractions)
+    _check(fractions, seed)
     order = np.random.default_rng(seed).permutation(count)
     ends = np.rint(np.cumsum(list(fractions.values())) * count).astype(int)
     parts = np.split(order, ends[:-1])
@@ -63,7 +63,7 @@ def by_view(
     Raises:
         ToolkitError: fractions are negative or do not sum to 1, or a split would be empty.
     """
-    _check(fractions)
+    _check(fractions, seed)
     known = np.flatnonzero(T_cam_obj.finite)
     views = T_cam_obj[known].inverse().translation
     views = views / np.linalg.norm(views, axis=-1, keepdims=True)
@@ -103,10 +103,10 @@ def split_session(
     with Session.open(path) as session:
         if by == "frame":
             found = by_frame(len(session), fractions, seed)
-        elif not session.objects:
+        elif not (annotated := session.contents.names("poses/objects")):
             raise SessionError(f"{path} has no annotated object, so no views; run: s2p3 annotate {path}")
         else:
-            found = by_view(session.object_poses(session.objects[0]).T_cam_obj, fractions, seed)
+            found = by_view(session.object_poses(annotated[0]).T_cam_obj, fractions, seed)
     for name, indices in found.items():
         write_split(path, name, indices)
     return found
@@ -131,8 +131,11 @@ def _fibonacci_sphere(count: int) -> NDArray[np.float64]:
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
 
 
-def _check(fractions: Mapping[str, float]) -> None:
-    if not fractions or min(fractions.values()) < 0 or abs(sum(fractions.values()) - 1) > 1e-6:
+def _check(fractions: Mapping[str, float], seed: int) -> None:
+    if seed < 0:
+        raise ToolkitError(f"--seed {seed} is negative; give 0 or more")
+    shares = list(fractions.values())
+    if not (shares and all(share >= 0 for share in shares) and abs(sum(shares) - 1) <= 1e-6):
         raise ToolkitError(
             f"split fractions {dict(fractions)} must not be negative and must sum to 1; adjust one of them"
         )

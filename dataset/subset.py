@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import uuid
 from pathlib import Path
@@ -14,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from dataset.errors import SessionError
 from dataset.schema import declared_at
 from dataset.session import Session
-from dataset.session.files import LIBVER, open_for_reading
-from dataset.session.seals import leave_open, seal
+from dataset.session.files import check_new, create_whole, open_for_reading
+from dataset.session.seals import leave_open
 from dataset.validate.salvage import copy_content
 
 _SLICE = re.compile(r"(-?\d*):(-?\d*)(?::(\d+))?")
@@ -52,20 +51,14 @@ def subset(path: str | Path, out: str | Path, indices: ArrayLike) -> int:
             session.raw(int(index))  # a damaged frame must not be copied as a good one
         origin = f"{len(keep)} of {count} frames of session {session.session_id}"
     gone = np.setdiff1d(np.arange(count), keep)
-    file, _ = open_for_reading(path)
-    partial = out.with_name(out.name + ".partial")
-    try:
-        with file, h5py.File(partial, "w", libver=LIBVER) as target:
-            lost = copy_content(file, target, keep, gone, b"left out of the subset")
-            if lost:
-                raise SessionError(f"{path}: {lost[0]} is damaged; run first: s2p3 dataset repair {path}")
-            _drop_unknown(target)
-            target.attrs.update({"session_id": uuid.uuid4().hex, "origin": origin})
-            leave_open(target)
-            seal(target)
-        os.replace(partial, out)
-    finally:
-        partial.unlink(missing_ok=True)
+    size = path.stat().st_size * len(keep) // count
+    with open_for_reading(path)[0] as file, create_whole(out, size) as target:
+        lost = copy_content(file, target, keep, gone, b"left out of the subset")
+        if lost:
+            raise SessionError(f"{path}: {lost[0]} is damaged; run first: s2p3 dataset repair {path}")
+        _drop_unknown(target)
+        target.attrs.update({"session_id": uuid.uuid4().hex, "origin": origin})
+        leave_open(target)
     return len(keep)
 
 
@@ -87,7 +80,7 @@ def chosen_frames(session: Session, frames: str | None, split: str | None) -> ND
         start, stop, step = (int(part) if part else None for part in found.groups())
         if step != 0:
             return np.arange(len(session))[start:stop:step]
-    elif re.fullmatch(r"\d+(,\d+)*", text):
+    elif re.fullmatch(r"\d{1,18}(,\d{1,18})*", text):
         return np.array([int(part) for part in text.split(",")], dtype=np.int64)
     raise SessionError(f"--frames {text}: give a slice such as 0:100:2, or a list such as 3,5,8")
 
@@ -96,13 +89,6 @@ def require_complete(session: Session) -> None:
     """Raises SessionError where the recording is incomplete."""
     if not session.complete:
         raise SessionError(f"{session.path} is incomplete; run first: s2p3 dataset repair {session.path}")
-
-
-def check_new(path: Path) -> None:
-    """Makes the folder of a file to be. Raises SessionError where the file exists."""
-    if path.exists():
-        raise SessionError(f"{path} already exists; choose another name or remove it first")
-    path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def _drop_unknown(file: h5py.File) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from dataset.errors import ToolkitError
 from dataset.frames import Mosaic
@@ -94,7 +96,7 @@ def read_mosaic(path: Path) -> Raw:
             ) from error
     else:
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+    if image is None or image.ndim != 2 or not image.size or image.dtype not in (np.uint8, np.uint16):
         found = "no image" if image is None else f"{image.shape} {image.dtype}"
         raise ToolkitError(f"{path} is {found}; a raw mosaic is a grey image (H, W) of 8 or 16 bits")
     return image
@@ -103,14 +105,18 @@ def read_mosaic(path: Path) -> Raw:
 def _stamps(path: Path, names: list[str]) -> Stamps:
     known = ("file", *_INTEGERS, *_NUMBERS)
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
+        with path.open(newline="", encoding="utf-8-sig") as stream:  # with the mark that Excel writes, too
             rows = list(csv.DictReader(stream))
     except OSError as error:
         raise ToolkitError(f"{path} cannot be read ({error.strerror}); check the path") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ToolkitError(f"{path} is no CSV file ({error}); save it as CSV, UTF-8") from error
     columns = set(rows[0]) if rows else set()
     if "file" not in columns or not columns <= set(known):
         raise ToolkitError(f"{path}: its first line must name columns among {', '.join(known)}, with file")
     by_name = {row["file"]: row for row in rows}
+    if len(by_name) < len(rows):
+        raise ToolkitError(f"{path} names a file twice; leave one row of each")
     if missing := [name for name in names if name not in by_name]:
         raise ToolkitError(f"{path} has no row for {missing[0]}; add it, or remove the image")
     stamps = Stamps.unknown(len(names))
@@ -118,7 +124,25 @@ def _stamps(path: Path, names: list[str]) -> Stamps:
     for name in columns - {"file"}:
         try:
             values = [by_name[file][name] for file in names]
-            found[name] = np.array([int(v) if name in _INTEGERS else float(v) for v in values])
-        except ValueError as error:
+            integers = name in _INTEGERS
+            found[name] = np.array(
+                [int(v) if integers else float(v) for v in values], "i8" if integers else "f8"
+            )
+        except (ValueError, TypeError, OverflowError) as error:
             raise ToolkitError(f"{path}: the column {name} holds no number somewhere ({error})") from error
+        _check_column(path, name, found[name], names)
     return Stamps(**found)
+
+
+def _check_column(path: Path, name: str, values: NDArray[Any], names: list[str]) -> None:
+    """Raises ToolkitError where times do not grow with the files, or exposure or gain cannot be."""
+    wrong = ~np.isfinite(values) if name == "gain_db" else ~((values >= 0) & np.isfinite(values))
+    what = "is no time, exposure or gain"
+    if name == "exposure_us":
+        wrong |= values == 0
+    elif name in _INTEGERS and not wrong.any():
+        least = 1 if name == "camera_time_ns" else 0
+        wrong, what = np.append(False, np.diff(values) < least), "is not later than the file's before"
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise ToolkitError(f"{path}: {name} of {names[row]}, {values[row]}, {what}; correct it")

@@ -24,8 +24,8 @@ from dataset.session import (
     write_split,
 )
 from dataset.session.edit import write_depth, write_origin
+from dataset.session.files import check_new
 from dataset.session.records import Image, Images, Masks
-from dataset.subset import check_new
 from dataset.transforms import SE3
 
 

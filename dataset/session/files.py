@@ -49,6 +49,46 @@ def create(path: Path) -> h5py.File:
         ) from error
 
 
+def check_new(path: Path) -> None:
+    """Makes the folder of a file to be. Raises SessionError where the file exists."""
+    if path.exists():
+        raise SessionError(f"{path} already exists; choose another name or remove it first")
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
+@contextmanager
+def create_whole(path: Path, needs_bytes: int) -> Iterator[h5py.File]:
+    """A new session file, which is sealed and appears under its name when the block is left without an
+    exception; otherwise nothing is left.
+
+    Args:
+        path: of the file to be.
+        needs_bytes: about how large it becomes.
+
+    Raises:
+        SessionError: the path exists or cannot be written, or the disk has no room.
+    """
+    check_new(path)
+    if room(path.parent) < needs_bytes:
+        raise SessionError(
+            f"{path} needs {needs_bytes / 1e9:.1f} GB of free disk space; make room and repeat"
+        )
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with h5py.File(partial, "w", libver=LIBVER) as file:
+            yield file
+            seal(file)
+        os.replace(partial, path)
+    except (OSError, RuntimeError) as error:
+        raise SessionError(
+            f"{path} cannot be written ({str(error).splitlines()[0]}); check the folder, who may write, and "
+            "the free disk space"
+        ) from error
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
 def open_for_reading(path: Path) -> tuple[h5py.File, bool]:
     """Opens a session, and says whether it was left open by its writer (still recording, or killed).
 

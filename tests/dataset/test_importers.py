@@ -223,7 +223,9 @@ def raw_folder(tmp_path: Path) -> Path:
 
 def test_raw_mosaics_come_in(raw_folder: Path, tmp_path: Path) -> None:
     stamps = tmp_path / "stamps.csv"
-    stamps.write_text("file,camera_time_ns,exposure_us\nc.npy,3000,20.5\na.png,1000,20.5\nb.tiff,2000,20.5\n")
+    stamps.write_text(
+        "\ufefffile,camera_time_ns,exposure_us\nc.npy,3000,20.5\na.png,1000,20.5\nb.tiff,2000,20.5\n"
+    )
     out = tmp_path / "raw.h5"
     assert import_raw_folder(raw_folder, out, "mono", 12, stamps) == 3
     assert validate(out) == []
@@ -244,6 +246,13 @@ def test_raw_mosaics_come_in(raw_folder: Path, tmp_path: Path) -> None:
         (12, "file,colour\na.png,red\n", "must name columns"),
         (12, "file,camera_time_ns\na.png,1\n", r"no row for b\.tiff"),
         (12, "file,camera_time_ns\na.png,1\nb.tiff,x\nc.npy,3\n", "holds no number"),
+        (12, "file,camera_time_ns\na.png,1\nb.tiff\nc.npy,3\n", "holds no number"),
+        (12, f"file,camera_time_ns\na.png,1\nb.tiff,2\nc.npy,{10**25}\n", "holds no number"),
+        (12, "file,camera_time_ns\na.png,1\nb.tiff,2\nc.npy,3\nc.npy,4\n", "a file twice"),
+        (12, "file,camera_time_ns\na.png,1\nb.tiff,3\nc.npy,2\n", r"of c\.npy, 2, is not later"),
+        (12, "file,host_time_ns\na.png,-1\nb.tiff,3\nc.npy,4\n", r"of a\.png, -1, is no time"),
+        (12, "file,exposure_us\na.png,1\nb.tiff,0\nc.npy,4\n", r"of b\.tiff, 0\.0, is no"),
+        (12, "file,gain_db\na.png,1\nb.tiff,nan\nc.npy,4\n", r"of b\.tiff, nan, is no"),
     ],
 )
 def test_ambiguous_mosaics_are_refused(

@@ -31,6 +31,18 @@ def test_frames_are_divided_completely() -> None:
     assert all(np.all(np.diff(indices) > 0) for indices in found.values())
 
 
+@pytest.mark.parametrize(
+    ("fractions", "seed"),
+    [({"train": 0.9, "test": 0.9}, 0), ({"train": -1.0, "test": 2.0}, 0), ({"train": np.nan, "test": 1.0}, 0),
+     ({}, 0), (FRACTIONS, -1)],
+)  # fmt: skip
+def test_what_is_no_division_is_refused(fractions: dict[str, float], seed: int) -> None:
+    with pytest.raises(ToolkitError, match="negative"):
+        by_frame(100, fractions, seed)
+    with pytest.raises(ToolkitError, match="negative"):
+        by_view(hemisphere(50), fractions, seed)
+
+
 def test_a_seed_names_a_split() -> None:
     poses = hemisphere(400)
     for first, again, other in (

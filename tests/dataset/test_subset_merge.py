@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -203,3 +205,20 @@ def test_sessions_that_differ_are_refused(
     refused(scaled, "meshes of 'tetra' differ")
     with pytest.raises(SessionError, match="at least two"):
         merge([one], out)
+
+
+def test_a_disk_that_refuses_leaves_nothing(recorded: Path, tmp_path: Path) -> None:
+    """In a process of its own: HDF5 cannot close a file on a full disk."""
+    code = f"""
+import resource
+from dataset import SessionError
+from dataset.subset import subset
+resource.setrlimit(resource.RLIMIT_FSIZE, (65536, resource.RLIM_INFINITY))
+try:
+    subset({str(recorded)!r}, {str(tmp_path / "part.h5")!r}, [1, 2])
+except SessionError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "part.h5 cannot be written" in done.stdout, done
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["session.h5"]

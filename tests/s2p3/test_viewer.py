@@ -30,6 +30,7 @@ from s2p3.viewer.page import ViewerPage
 from s2p3.viewer.world import world_of
 
 FRAMES = 8
+GOLDEN = Path(__file__).parents[1] / "dataset" / "golden" / "session-1.1.h5"
 Images = Callable[[Page], list[NDArray[np.uint8]]]
 
 
@@ -187,9 +188,10 @@ def test_what_cannot_be_shown_costs_one_line(
         (["dataset", "view", "s.h5", "--host", "192.168.0.9"], "give a --token"),
         (["dataset", "view", "s.h5", "--token", "easy"], "16 characters"),
         (["dataset", "view", "s.h5", "--every", "0"], "--every 0 is too small"),
+        (["dataset", "view", str(GOLDEN), "--host", "no where", "--token", "a" * 16], "is no address"),
     ],
 )
-def test_a_page_for_the_network_needs_a_token(
+def test_a_page_that_cannot_be_served_costs_one_line(
     words: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(words) == 2

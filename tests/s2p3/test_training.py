@@ -5,6 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import fields
 from pathlib import Path
 
@@ -12,15 +16,17 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 
 from dataset import SE3
 from dataset.errors import ToolkitError
-from dataset.session import Session, mask_box
+from dataset.session import Session, mask_box, write_split
 from s2p3 import config as presets
-from s2p3.config import AugmentationConfig, ExperimentConfig
+from s2p3.config import AugmentationConfig, ExperimentConfig, FrameSource
 from s2p3.inputs import View
 from s2p3.networks.detector import Detection
+from s2p3.networks.pose_head import ray_rotation, site_from_translation
 from s2p3.networks.teacher import Teacher
 from s2p3.objects import ObjectModel, Symmetry, build
 from s2p3.rendering.differentiable import RenderMesh
@@ -36,10 +42,12 @@ from s2p3.training import (
     train_teacher,
 )
 from s2p3.training.batches import form_input, form_targets
-from s2p3.training.crops import canonical_pose
+from s2p3.training.crops import canonical_pose, content_hashes
 from s2p3.training.detection import box_distances, detector_losses
-from s2p3.training.pretrain import load_student, load_teacher
+from s2p3.training.examples import divide
+from s2p3.training.pretrain import ALL_FRAMES, load_student, load_teacher
 from s2p3.training.pseudo_labels import carry_labels, make_labels
+from s2p3.training.scoring import PoseScorer
 
 
 def tiny() -> ExperimentConfig:
@@ -153,6 +161,74 @@ def test_checkpoints_say_what_they_are(trained: Path, cup: ObjectModel) -> None:
         load_student(trained / "nothing.safetensors")
 
 
+def test_weights_are_chosen_on_frames_that_were_kept_from_the_training(
+    trained: Path, cup_session: Path, cup: ObjectModel
+) -> None:
+    _, info = load_student(trained / "student.safetensors", "cup")
+    assert info.validation is not None
+    assert info.validation.metric == "add_recall_10"
+    assert info.validation.frames == "2 of 8 frames, drawn with seed 0"
+    scores = {line["step"]: line["add_recall_10"] for line in log_of(trained / "student.log.jsonl")[1::2]}
+    assert (info.step, info.validation.value) == max(scores.items(), key=lambda item: (item[1], -item[0]))
+    division = divide([cup_session], cup, tiny().student, ALL_FRAMES)
+    assert not {*division.rows.tolist()} & {*division.held_out.tolist()}
+    with safe_open(trained / "student.safetensors", "pt") as file:
+        described = json.loads(file.metadata()["s2p3"])
+    assert described == json.loads((trained / "student.json").read_text())
+    assert list(described["data"].values()) == list(content_hashes([cup_session], cup).values())
+    assert described["commit"] == checkpoint.toolkit_commit()
+
+
+def test_frames_to_validate_on_are_named_by_split_or_session(
+    cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    session = shutil.copy(cup_session, tmp_path / "split.h5")
+    write_split(session, "train", [0, 2, 3, 6])
+    write_split(session, "val", [2, 5])
+
+    def chosen(split: str | None, validation: str | None) -> tuple[list[int], list[int]]:
+        division = divide([session], cup, tiny().student, FrameSource(split, validation))
+        return division.rows.tolist(), division.held_out.tolist()
+
+    rows, held_out = chosen("train", None)
+    assert (len(held_out), sorted(rows + held_out)) == (1, [0, 2, 3, 6])
+    assert chosen(None, "val") == ([0, 1, 3, 4, 6, 7], [2, 5])
+    assert chosen("train", "val") == ([0, 3, 6], [2, 5])
+    assert chosen("train", str(cup_session)) == ([0, 2, 3, 6], [])
+    with pytest.raises(ToolkitError, match=r"no split 'night' \(its splits: train, val\)"):
+        chosen(None, "night")
+
+
+def test_a_true_pose_scores_full_marks(cup_session: Path, crops: LabelledCrops, cup: ObjectModel) -> None:
+    """By ADD; turned about its axis, an object that looks the same scores by ADD-S only."""
+
+    class Oracle(torch.nn.Module):
+        def __init__(self, turn: SE3) -> None:
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.zeros(1))
+            self.turn, self.given = turn, 0
+
+        def forward(self, polarization: torch.Tensor, priors: torch.Tensor) -> torch.Tensor:
+            del priors
+            view = View.centred(8, experiment.input.zoom)
+            K = form_input(crops, torch.arange(8), view, 1.5, experiment).K
+            rotation = crops.rotation @ torch.tensor(self.turn.rotation, dtype=torch.float32)
+            site = site_from_translation(crops.translation, K, polarization.shape[-1], cup.diameter)
+            allocentric = ray_rotation(crops.translation).transpose(1, 2) @ rotation
+            columns = allocentric[:, :, :2].transpose(1, 2).reshape(-1, 6)
+            identity = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 1])
+            return torch.cat([columns, site], dim=1) - identity
+
+    experiment = tiny()
+    still, turned = SE3.identity(), SE3.from_rotvec(np.array([0.0, 0.0, 2.0]), np.zeros(3))
+    assert PoseScorer(crops, cup, experiment)(Oracle(still)) == 100
+    assert PoseScorer(crops, cup, experiment)(Oracle(turned)) == 0
+    bottle = dataclasses.replace(build("bottle"), diameter=cup.diameter)
+    scorer = PoseScorer(crops, bottle, experiment)
+    assert scorer.name == "add_s_recall_10"
+    assert scorer(Oracle(turned)) == 100
+
+
 def test_weights_of_another_network_are_refused(trained: Path, tmp_path: Path) -> None:
     shutil.copy(trained / "student.safetensors", tmp_path / "teacher.safetensors")
     shutil.copy(trained / "teacher.json", tmp_path / "teacher.json")
@@ -179,6 +255,32 @@ def test_a_stopped_training_resumes_exactly(
     a, b = (load_file(folder / "student.safetensors") for folder in (trained, tmp_path))
     assert all(torch.equal(a[name], b[name]) for name in a)
     assert not (tmp_path / "student.resume.safetensors").exists()
+
+
+def test_a_killed_training_goes_on_as_if_nothing_had_happened(
+    trained: Path, cup_session: Path, tmp_path: Path
+) -> None:
+    """A process of the command line, its batches made by a worker, killed by SIGKILL; the second one and the
+    first one's log are, to the last bit, a training that was left alone and made its batches itself."""
+    presets.save(tiny(), tmp_path / "experiment.toml")
+    words = ["train", "student", cup_session, "--object", "cup", "--config", tmp_path / "experiment.toml"]
+    command = [sys.executable, "-m", "s2p3.cli", *words, "--out", tmp_path, "--workers", "1"]
+    first = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    resume = tmp_path / "student.resume.safetensors"
+    until = time.monotonic() + 240
+    while not resume.exists() and first.poll() is None and time.monotonic() < until:
+        time.sleep(0.01)
+    first.kill()
+    assert first.wait() == -signal.SIGKILL
+    assert resume.exists()
+    assert not (tmp_path / "student.safetensors").exists()
+    subprocess.run(command, check=True, capture_output=True, timeout=240)
+    whole, resumed = log_of(trained / "student.log.jsonl"), log_of(tmp_path / "student.log.jsonl")
+    for line in (*whole, *resumed):
+        del line["seconds"]
+    assert whole == resumed
+    a, b = (load_file(folder / "student.safetensors") for folder in (trained, tmp_path))
+    assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_a_resume_file_of_other_settings_is_refused(

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TextIO
 
 import tyro
 
-from dataset.errors import ToolkitError
+from dataset.errors import ToolkitError, ToolkitWarning
 from s2p3.commands import calibrate, capture, console, demo, devices, exchange, learn, sessions, train, use
 from s2p3.commands.experiment import with_defaults
 
@@ -78,6 +80,7 @@ VERBS: dict[str, Verb | Group] = {
             "detector": train.train_detector,
             "teacher": train.train_teacher,
             "student": train.train_student,
+            "supervised": train.train_supervised,
             "self-supervised": train.train_self_supervised,
         },
     ),
@@ -103,7 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        _dispatch(words)
+        with _warnings_in_a_line():
+            _dispatch(words)
         sys.stdout.flush()
     except ToolkitError as error:
         print(f"s2p3: {error}", file=sys.stderr)
@@ -120,6 +124,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"s2p3: {error.filename}: {error.strerror}; check the path and who may write", file=sys.stderr)
         return _USER_MISTAKE
     return 0
+
+
+@contextmanager
+def _warnings_in_a_line() -> Iterator[None]:
+    """The toolkit's warnings are told as its errors are; those of others as ever."""
+    with warnings.catch_warnings():
+        as_ever = warnings.showwarning
+
+        def tell(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, ToolkitWarning):
+                print(f"s2p3: warning: {message}", file=sys.stderr)
+            else:
+                as_ever(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = tell
+        yield
 
 
 def _dispatch(words: list[str]) -> None:

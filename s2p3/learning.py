@@ -9,12 +9,13 @@ from pathlib import Path
 
 from dataset.errors import SessionError
 from dataset.session import Session
-from s2p3.config import SelfSupervisionConfig
+from s2p3.config import Self6DConfig, SelfSupervisionConfig
 from s2p3.evaluation import Estimator, Evaluation, evaluate, find_objects
 from s2p3.evaluation.evaluate import targets_of
 from s2p3.objects import ObjectModel
-from s2p3.training import captured_crops, self_supervise
-from s2p3.training.checkpoint import read_info
+from s2p3.training import captured_crops, self_supervise, self_supervise_rgbd
+from s2p3.training.crops import depth_of
+from s2p3.training.self_supervised import load_pair
 
 
 def adapt(
@@ -25,10 +26,14 @@ def adapt(
     teacher: Path,
     student: Path,
     out: Path,
-    settings: SelfSupervisionConfig | None = None,
+    settings: SelfSupervisionConfig | Self6DConfig | None = None,
     workers: int = 0,
 ) -> Path:
     """Self-supervised training of a student on a split of captured frames; no pose of the session is read.
+
+    Args:
+        settings: of the paper's method, as the student's experiment has them when None, or of the RGB-D
+            baseline.
 
     Returns:
         `out`/adapted.safetensors.
@@ -37,11 +42,14 @@ def adapt(
         SessionError: no such split.
         ToolkitError: the object is detected in no frame; checkpoints of another object.
     """
-    config = read_info(student, "student", model.name).config
+    config = load_pair(teacher, student, model.name).config
     with Session.open(session) as opened:
         indices = frames_of(opened, split)
+        depth_of(opened, indices[0], config.input)  # a mistake is told before the detector has run
         detections = find_objects(opened, indices, detector, model.name)
         crops = captured_crops(opened, indices, detections, config.input)
+    if isinstance(settings, Self6DConfig):
+        return self_supervise_rgbd(crops, model, teacher, student, out, settings, workers=workers)
     return self_supervise(crops, model, teacher, student, out, settings, workers=workers)
 
 
@@ -68,10 +76,10 @@ def evaluate_split(
 
 
 def frames_of(session: Session, split: str) -> list[int]:
-    """Frame indices of a split.
+    """Frame indices of a split, one at least.
 
     Raises:
-        SessionError: the session has no such split.
+        SessionError: the session has no such split, or it is empty.
     """
     if split not in session.splits:
         known = ", ".join(session.splits) or "none"
@@ -79,4 +87,6 @@ def frames_of(session: Session, split: str) -> list[int]:
             f"{session.path}: no split {split!r} (its splits: {known}); "
             f"make one with: s2p3 dataset split {session.path}"
         )
+    if not len(session.splits[split]):
+        raise SessionError(f"{session.path}: the split {split!r} is empty; choose another, or make it again")
     return [int(index) for index in session.splits[split]]

@@ -28,6 +28,7 @@ from s2p3.config import (
     InputConfig,
     NetworkConfig,
     PretrainConfig,
+    Self6DConfig,
     SelfSupervisionConfig,
     load,
 )
@@ -68,14 +69,21 @@ class StudentPart(Part):
 
 
 @dataclass(frozen=True)
+class SupervisedPart(StudentPart):
+    teacher: PretrainConfig = _FAST.teacher
+
+
+@dataclass(frozen=True)
 class SelfSupervisionPart(Part):
     self_supervision: SelfSupervisionConfig = _FAST.self_supervision
+    self6d: Self6DConfig = _FAST.self6d
 
 
 _UNDER_CONFIG: Any = tyro.conf.arg(name="config")
 DetectorFields = Annotated[DetectorPart, _UNDER_CONFIG]
 TeacherFields = Annotated[TeacherPart, _UNDER_CONFIG]
 StudentFields = Annotated[StudentPart, _UNDER_CONFIG]
+SupervisedFields = Annotated[SupervisedPart, _UNDER_CONFIG]
 SelfSupervisionFields = Annotated[SelfSupervisionPart, _UNDER_CONFIG]
 
 

@@ -25,6 +25,8 @@ from s2p3.commands.experiment import (
     SelfSupervisionPart,
     StudentFields,
     StudentPart,
+    SupervisedFields,
+    SupervisedPart,
     TeacherFields,
     TeacherPart,
     experiment_of,
@@ -38,7 +40,8 @@ if TYPE_CHECKING:
 Frames = Annotated[FrameSource, tyro.conf.arg(name="")]
 _FRAMES = FrameSource(workers=1)
 _DETECTOR, _TEACHER, _STUDENT = DetectorPart(), TeacherPart(), StudentPart()
-_SELF_SUPERVISION = SelfSupervisionPart()
+_SUPERVISED, _SELF_SUPERVISION = SupervisedPart(), SelfSupervisionPart()
+_ANNOTATED = FrameSource(split="train", workers=1)
 
 
 def train_detector(
@@ -158,6 +161,41 @@ def train_student(
     say(str(train(_some(sessions), model, chosen, out, cache=out.parent, teacher=teacher, frames=frames)))
 
 
+def train_supervised(
+    sessions: Sessions,
+    *,
+    object: ObjectName,
+    out: Path,
+    network: Literal["teacher", "student"] = "teacher",
+    mesh: OptionalPath = None,
+    preset: Preset = "fast",
+    config: OptionalPath = None,
+    threads: int = 1,
+    frames: Frames = _ANNOTATED,
+    experiment: SupervisedFields = _SUPERVISED,
+) -> None:
+    """Train on annotated captured frames, as on synthetic ones: the upper bound that needs annotations.
+
+    Args:
+        sessions: annotated sequences.
+        object: cup, fork, knife, bottle, or the name of the object in --mesh.
+        out: folder for teacher.safetensors or student.safetensors; an interrupted training continues.
+        network: the teacher is PPP-Net, the paper's upper bound.
+        mesh: PLY, OBJ or STL of the object, metres.
+        preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
+        config: experiment.toml instead of a preset.
+        threads: CPU threads of the network.
+    """
+    from s2p3.objects import named_object
+    from s2p3.training import train_student
+    from s2p3.training import train_teacher as train_on
+
+    _use(threads, frames.workers)
+    chosen, model = experiment.within(experiment_of(preset, config)), named_object(object, mesh)
+    train = train_on if network == "teacher" else train_student
+    say(str(train(_some(sessions), model, chosen, out, frames=frames, stage="supervised")))
+
+
 def train_self_supervised(
     session: tyro.conf.Positional[Path],
     *,
@@ -169,6 +207,7 @@ def train_self_supervised(
     mesh: OptionalPath = None,
     config: OptionalPath = None,
     split: str = "train",
+    method: Literal["s2p3", "self6d"] = "s2p3",
     threads: int = 1,
     workers: int = 1,
     experiment: SelfSupervisionFields = _SELF_SUPERVISION,
@@ -185,6 +224,8 @@ def train_self_supervised(
         mesh: PLY, OBJ or STL of the object, metres.
         config: experiment.toml whose [self_supervision] to use instead of the student's.
         split: name of the split to train on.
+        method: s2p3 is the paper's, self6d the RGB-D baseline, after Self6D++: it needs depth, and networks
+            trained with --config.input.modality rgb.
         threads: CPU threads of the network.
         workers: processes that augment, a thread each; 0: the training does it itself.
     """
@@ -193,7 +234,8 @@ def train_self_supervised(
     from s2p3.objects import named_object
 
     _use(threads, workers)
-    model, settings = named_object(object, mesh), experiment.self_supervision
+    model = named_object(object, mesh)
+    settings = experiment.self_supervision if method == "s2p3" else experiment.self6d
     say(str(adapt(session, split, model, detector, teacher, student, out, settings, workers)))
 
 

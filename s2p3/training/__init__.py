@@ -3,6 +3,7 @@
 from s2p3.training.crops import Crops, LabelledCrops, captured_crops, labelled_crops
 from s2p3.training.detection import train_detector
 from s2p3.training.pretrain import train_student, train_teacher
+from s2p3.training.self6d import self_supervise_rgbd
 from s2p3.training.self_supervised import self_supervise
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "captured_crops",
     "labelled_crops",
     "self_supervise",
+    "self_supervise_rgbd",
     "train_detector",
     "train_student",
     "train_teacher",

@@ -45,7 +45,7 @@ class CheckpointInfo:
 
     Attributes:
         kind: of network.
-        stage: "pretrained" or "self-supervised".
+        stage: "pretrained", "supervised" (on annotated captured frames) or "self-supervised".
         object_name, diameter_m, refractive_index: of the object it was trained for; of a detector of several,
             of the first.
         step: optimizer steps after which the weights were these.

@@ -24,6 +24,9 @@ MOST_HELD_OUT = 256
 class CropSource(Protocol):
     """Labelled crops by row: in memory (`LabelledCrops`) or off the disk (`CropDataset`)."""
 
+    def __len__(self) -> int:
+        """How many rows there are."""
+
     def take(self, rows: Tensor) -> LabelledCrops:
         """Some rows as one batch."""
 
@@ -60,12 +63,12 @@ class Examples:
 
         Raises ToolkitError: a session lacks the object or the split, or no frame shows it.
         """
+        division = divide(sessions, model, settings, frames)
         source: CropSource
         if frames.storage == "memory":
             source = labelled_crops(sessions, model, config, cache)
         else:
             source = CropDataset(sessions, model, config)
-        division = divide(sessions, model, settings, frames)
         if division.session is not None:
             other = labelled_crops([division.session], model, config, cache)
             return Examples(source, division.rows, other, division.origin)

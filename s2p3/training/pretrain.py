@@ -1,4 +1,5 @@
-"""Supervised pre-training of teacher and student on synthetic sessions.
+"""Supervised training of teacher and student: on synthetic sessions at first, or, for the paper's upper
+bound, on annotated captured ones.
 
 The paper supervises both by poses alone: point matching for the rotation, L1 for the translation. The
 teacher's dense losses (`dense_weight`) and the warm start are our choice; `s2p3.config.paper` turns them off.
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -32,6 +34,7 @@ from s2p3.training.progress import OnStep
 from s2p3.training.scoring import PoseScorer
 from s2p3.training.signal import labelled_signal, report_signal
 
+Stage = Literal["pretrained", "supervised"]
 ALL_FRAMES = FrameSource()
 MODEL_POINTS = 300
 _SYMMETRY_STEPS = 36
@@ -45,6 +48,7 @@ def train_teacher(
     cache: Path | None = None,
     on_step: OnStep | None = None,
     frames: FrameSource = ALL_FRAMES,
+    stage: Stage = "pretrained",
 ) -> Path:
     """Pre-trains the teacher and writes `out`/teacher.safetensors, which is returned.
 
@@ -53,6 +57,7 @@ def train_teacher(
         cache: folder for the crops, shared between trainings.
         on_step: see `loop.optimize`.
         frames: which of the sessions to train on, and how they reach the training.
+        stage: what the checkpoint calls this training.
 
     Raises ToolkitError: a session lacks the object; see also `loop.optimize`.
     """
@@ -61,7 +66,7 @@ def train_teacher(
     torch.manual_seed(settings.seed)
     network = build_teacher(config, imagenet=True)
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
-    run = Pretraining("teacher", model, config, settings, examples, content_hashes(sessions, model))
+    run = Pretraining("teacher", model, config, settings, examples, content_hashes(sessions, model), stage)
     return run.train(network, objective, out, frames.workers, on_step)
 
 
@@ -74,6 +79,7 @@ def train_student(
     teacher: Path | None = None,
     on_step: OnStep | None = None,
     frames: FrameSource = ALL_FRAMES,
+    stage: Stage = "pretrained",
 ) -> Path:
     """Pre-trains the student and writes `out`/student.safetensors, which is returned.
 
@@ -95,7 +101,7 @@ def train_student(
             )
         network.encoder.load_state_dict(load_teacher(teacher, model.name)[0].encoder.state_dict())
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
-    run = Pretraining("student", model, config, settings, examples, content_hashes(sessions, model))
+    run = Pretraining("student", model, config, settings, examples, content_hashes(sessions, model), stage)
     return run.train(network, objective, out, frames.workers, on_step)
 
 
@@ -109,6 +115,7 @@ class Pretraining:
     settings: PretrainConfig
     examples: Examples
     hashes: dict[str, str]
+    stage: Stage
 
     def train(
         self,
@@ -143,7 +150,7 @@ class Pretraining:
         if score is not None and trained.score is not None:
             validation = Validation(score.name, trained.score, examples.origin)
         info = CheckpointInfo.of(
-            self.kind, "pretrained", self.model, trained.step, self.config, self.hashes, validation
+            self.kind, self.stage, self.model, trained.step, self.config, self.hashes, validation
         )
         checkpoint.save(path, trained.network.state_dict(), info)
         return path

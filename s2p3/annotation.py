@@ -15,7 +15,15 @@ import numpy as np
 
 from calibration import Calibration, camera_poses
 from dataset import SE3, CalibrationError, Intrinsics
-from dataset.session import ObjectPoses, Session, mask_box, write_calibration, write_object, write_poses
+from dataset.session import (
+    ObjectPoses,
+    PackedMasks,
+    Session,
+    mask_box,
+    write_calibration,
+    write_object,
+    write_poses,
+)
 from s2p3.objects import ObjectModel
 from s2p3.rendering.rasterizer import projected_region, rasterize
 
@@ -84,7 +92,7 @@ def render_poses(
     shift = np.array([[0, 0, width], [0, 0, height], [0, 0, 0]])
     canvas = Intrinsics(camera.K + shift, camera.distortion, 3 * height, 3 * width)
     count = len(session)
-    masks = np.zeros((count, height, width), dtype=bool)
+    masks = [np.packbits(np.zeros((height, width), dtype=bool))] * count
     boxes = np.zeros((count, 4))
     visible = np.zeros(count)
     for index in range(count):
@@ -93,9 +101,10 @@ def render_poses(
             raster = rasterize(model.mesh, pose, canvas, projected_region(model.mesh, pose, canvas))
             drawn = np.zeros((3 * height, 3 * width), dtype=bool)
             drawn[raster.window] = raster.mask
-            masks[index] = drawn[height : 2 * height, width : 2 * width]
-            boxes[index] = mask_box(masks[index])
-            visible[index] = masks[index].sum() / max(raster.mask.sum(), 1)
+            mask = drawn[height : 2 * height, width : 2 * width]
+            masks[index] = np.packbits(mask)
+            boxes[index] = mask_box(mask)
+            visible[index] = mask.sum() / max(raster.mask.sum(), 1)
         if on_progress is not None:
             on_progress(index + 1, count)
-    return ObjectPoses(T_cam_obj, visible, boxes, masks)
+    return ObjectPoses(T_cam_obj, visible, boxes, PackedMasks(masks, (height, width)))

@@ -131,7 +131,7 @@ def write_split(path: str | Path, name: str, indices: ArrayLike) -> None:
         SessionError: the file cannot be edited, an index is repeated or out of range.
     """
     path = Path(path)
-    _check_name(name)
+    check_name(name)
     with open_for_editing(path) as file:
         count = len(file["camera/raw"])
         chosen = np.sort(np.asarray(indices, dtype=np.int64).ravel())
@@ -185,7 +185,7 @@ def store_intrinsics(file: h5py.File, intrinsics: Intrinsics) -> None:
 
 def store_object(file: h5py.File, record: ObjectRecord) -> None:
     """Writes /objects/<name> into an open file, replacing one of the same name."""
-    _check_name(record.name)
+    check_name(record.name)
     vertices, faces = np.asarray(record.vertices), np.asarray(record.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise SessionError(
@@ -281,7 +281,8 @@ def _mosaic_size(file: h5py.File) -> tuple[int, int]:
     return int(attrs["height"]), int(attrs["width"])
 
 
-def _check_name(name: str) -> None:
+def check_name(name: str) -> None:
+    """Raises a SessionError unless a session can hold an object or a split of this name."""
     if not _NAME.fullmatch(name):
         raise SessionError(f"the name {name!r} may hold only letters, digits, '_', '-' and '.'")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -25,6 +26,26 @@ class Images(Protocol[Image]):
 
 Masks = Images[NDArray[np.bool_]]
 """N visible masks, each (h, w) bool."""
+
+
+@dataclass(frozen=True, eq=False)
+class PackedMasks:
+    """Masks kept a bit a pixel, so that those of a long session fit into memory.
+
+    Attributes:
+        packed: N times `np.packbits` of a mask.
+        shape: (h, w) of each.
+    """
+
+    packed: Sequence[NDArray[np.uint8]]
+    shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.packed)
+
+    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
+        bits = np.unpackbits(self.packed[index], count=self.shape[0] * self.shape[1])
+        return bits.reshape(self.shape).astype(bool)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from acquisition.camera import Camera, CameraLost
 from dataset.errors import DeviceError, ToolkitError
-from dataset.frames import RawFrame
+from dataset.frames import CameraInfo, RawFrame
 from dataset.session import Chunk, SessionWriter, compress
 
 if TYPE_CHECKING:
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 QUEUE_FULL = "recorder busy: queue full"
 NOT_RECEIVED = "lost on the way, or not read in time"
 
+_MEMORY_BYTES = 400_000_000
+_FEWEST_HELD, _MOST_HELD = 8, 256
+"""Our choice. A disk that writes back what it has cached can stand still for seconds: what is held meanwhile
+is stored afterwards, what is not held is lost for certain."""
 _SECOND_LOOK_S = 0.5
 _LATENCIES = 16384
 _LARGEST_GAP = 100_000
@@ -140,8 +144,7 @@ class FrameStream:
     Args:
         camera: started.
         ledger: of the session.
-        depth: frames held in memory at most, beside the camera's own buffers; by default those of a second at
-            full rate, which is the most that a killed recording loses.
+        depth: frames held in memory at most, beside the camera's own buffers; None for what fits 400 MB.
         threads: that compress.
 
     Attributes:
@@ -150,7 +153,9 @@ class FrameStream:
         latencies_ms: of the newest stored frames, from their first packet to their being in the file.
     """
 
-    def __init__(self, camera: Camera, ledger: FrameLedger, *, depth: int = 24, threads: int = 2) -> None:
+    def __init__(
+        self, camera: Camera, ledger: FrameLedger, *, depth: int | None = None, threads: int = 2
+    ) -> None:
         self.failed = threading.Event()
         self.latest: RawFrame | None = None
         self.latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
@@ -160,7 +165,7 @@ class FrameStream:
         self._pause: str | None = None
         self._error: Exception | None = None
         self._stopping = threading.Event()
-        self._slots = threading.Semaphore(depth)
+        self._slots = threading.Semaphore(_depth(camera.info) if depth is None else depth)
         self._items: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="compress")
         self._reader = threading.Thread(target=self._read, name="read-frames")
@@ -260,3 +265,9 @@ class FrameStream:
         self._error = self._error or error
         self._stopping.set()
         self.failed.set()
+
+
+def _depth(info: CameraInfo) -> int:
+    """How many frames of a camera to hold in memory."""
+    frame_bytes = info.width * info.height * (1 if info.bits <= 8 else 2)
+    return min(max(_MEMORY_BYTES // frame_bytes, _FEWEST_HELD), _MOST_HELD)

@@ -42,6 +42,14 @@ def wait_for(frames: int, recorder: Recorder) -> None:
         time.sleep(0.01)
 
 
+def until_written(recorder: Recorder) -> None:
+    """What was under way when it was paused."""
+    deadline = time.monotonic() + 20.0
+    while recorder.status.queued:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 def test_a_pause_is_declared_and_no_loss(tmp_path: Path, camera: AravisCamera) -> None:
     path = tmp_path / "s.h5"
     with SessionWriter(path, "sequence", camera.info) as writer, Recorder(camera, None, writer) as recorder:
@@ -49,6 +57,7 @@ def test_a_pause_is_declared_and_no_loss(tmp_path: Path, camera: AravisCamera) -
         recorder.pause("looking for the cup")
         assert recorder.status.pausing
         time.sleep(0.3)
+        until_written(recorder)
         held, seen = recorder.status.stored, recorder.latest
         time.sleep(0.3)
         assert recorder.status.stored == held

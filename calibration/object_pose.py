@@ -23,7 +23,9 @@ _STARTS = 240
 _COARSE_STEPS = 12
 _PROMISING = 80
 _NOISE_FLOOR_M = 1e-4  # touching is no better than this (our choice); keeps a perfect fit's covariance honest
-_BAD_FIT_M = 5e-3
+_BAD_FIT_M = 2.5e-3
+_BAD_FIT_SHARE = 0.015
+"""Of the mesh's size: a large object's mesh is not as exact."""
 _DOUBTFUL_FIT_M = 1.5e-3
 """From here on it is worth asking whether the mirror image fits better (our choice)."""
 _AS_GOOD = 1.25
@@ -44,6 +46,7 @@ class ObjectPoseResult:
         rms_m: root mean square distance of the points to the surface.
         distance_m: (n,) signed distances, positive outside.
         unobservable: what the points leave open, in words; empty when the pose is determined.
+        rivals: poses elsewhere that fit as well, in words; only a search without a guess finds them.
         ambiguity_deg: angles by which the object can be turned about the weakest axis without contradicting
             the points (a discrete or continuous symmetry); empty when there are none.
         runner_up_rms_m: the best fit of a clearly different pose that is no symmetry of the object; close
@@ -56,6 +59,7 @@ class ObjectPoseResult:
     rms_m: float
     distance_m: Floats
     unobservable: tuple[str, ...]
+    rivals: tuple[str, ...]
     ambiguity_deg: Floats
     runner_up_rms_m: float
 
@@ -96,7 +100,7 @@ def register_points(
     surface = Surface.of(mesh, tip.ball_m, seed)
     coarse, coarse_rms = _nearest_fits(points, surface, init, seed)
     best = coarse[int(np.argmin(coarse_rms))]
-    limit = max(_BAD_FIT_M, 0.03 * float(np.linalg.norm(mesh.extents)))
+    limit = max(_BAD_FIT_M, _BAD_FIT_SHARE * float(np.linalg.norm(mesh.extents)))
     if coarse_rms.min() > 3 * limit:
         _require_fit(float(coarse_rms.min()), limit, points, surface, seed)
     pose, signed, normals = finest_fit(points, surface, best, seed)
@@ -111,8 +115,7 @@ def register_points(
     covariance, unobservable = describe(found, turn, ambiguity, known_axis, symmetry_turns, surface.radius)
     alike = coarse if known_axis is None else turned_alike(coarse, pose, known_axis)
     rival, rival_rms = _rival(alike, coarse_rms, pose, symmetry_turns, surface.radius)
-    if len(ambiguity) == 0 and rival_rms < _AS_GOOD * max(float(coarse_rms.min()), _NOISE_FLOOR_M):
-        unobservable = (*unobservable, _as_good(pose.inverse() @ rival))
+    as_good = len(ambiguity) == 0 and rival_rms < _AS_GOOD * max(float(coarse_rms.min()), _NOISE_FLOOR_M)
     return ObjectPoseResult(
         T_base_obj=pose,
         covariance=covariance,
@@ -120,6 +123,7 @@ def register_points(
         rms_m=rms,
         distance_m=signed,
         unobservable=unobservable,
+        rivals=(_as_good(pose.inverse() @ rival),) if as_good else (),
         ambiguity_deg=ambiguity,
         runner_up_rms_m=rival_rms,
     )
@@ -196,7 +200,7 @@ def _require_fit(rms: float, limit: float, points: Floats, surface: Surface, see
         raise CalibrationError(
             f"object pose: the best fit leaves the points {1000 * rms:.1f} mm from the surface; check the"
             f" mesh's units (it is {1000 * np.linalg.norm(mesh.extents):.0f} mm across), the tool tip's"
-            " offset, and that the right object was touched"
+            " offset and radius, and that the right object was touched"
         )
 
 

@@ -97,28 +97,45 @@ def bars(
     return _svg(width, height, parts, "bars")
 
 
-def curve(x: Floats, y: Floats, mark_x: float, x_label: str, y_unit: str) -> str:
+def curve(x: Floats, y: Floats, mark_x: float, x_label: str, y_label: str) -> str:
     """y over x on a logarithmic scale, with a mark at ``mark_x``."""
-    width, height, left, bottom = 520, 250, 56, 38
-    finite = np.isfinite(y) & (y > 0)
-    x, y = x[finite], y[finite]
+    positive = np.isfinite(y) & (y > 0)
+    x, y = x[positive], y[positive]
     low, high = np.floor(np.log10(y.min())), np.ceil(np.log10(y.max()) + 1e-9)
+    span = max(high - low, 1.0)
+    ticks = {f"{10.0**decade:g}": (decade - low) / span for decade in np.arange(low, high + 1)}
+    return _graph(x, (np.log10(y) - low) / span, ticks, mark_x, x_label, y_label)
+
+
+def correlation_curve(x: Floats, y: Floats, mark_x: float, x_label: str) -> str:
+    """A correlation y over x, from -1 to 1, with a mark at ``mark_x``."""
+    told = np.isfinite(y)
+    ticks = {f"{value:g}": 0.5 * (value + 1.0) for value in (-1.0, -0.5, 0.0, 0.5, 1.0)}
+    return _graph(x[told], 0.5 * (y[told] + 1.0), ticks, mark_x, x_label, "correlation")
+
+
+def _graph(
+    x: Floats, tall: Floats, ticks: dict[str, float], mark_x: float, x_label: str, y_label: str
+) -> str:
+    """A line through points whose heights, and those of the ticks, are parts of the picture's."""
+    width, height, left, bottom = 520, 290, 56, 38
     to_x = lambda v: left + (v - x[0]) / (x[-1] - x[0]) * (width - left - 14)  # noqa: E731
-    to_y = lambda v: 10 + (high - np.log10(v)) / max(high - low, 1) * (height - bottom - 10)  # noqa: E731
+    to_y = lambda part: 10 + (1.0 - part) * (height - bottom - 10)  # noqa: E731
     parts: list[str] = []
-    for decade in np.arange(low, high + 1):
-        parts.append(_line(left, to_y(10.0**decade), width - 14, to_y(10.0**decade), "var(--line)"))
-        parts.append(_text(left - 8, to_y(10.0**decade) + 4, f"{10.0**decade:g}", "end"))
-    parts.append(_text(left + 6, 22, y_unit, "start"))
-    for tick in np.linspace(x[0], x[-1], 7):
-        parts.append(_text(to_x(tick), height - bottom + 18, f"{np.round(tick, 6) + 0.0:g}", "middle"))
+    for text, part in ticks.items():
+        parts.append(_line(left, to_y(part), width - 14, to_y(part), "var(--line)"))
+        parts.append(_text(left - 8, to_y(part) + 4, text, "end"))
+    parts.append(_text(left + 6, 26, y_label, "start"))
+    step = _nice_ceiling((x[-1] - x[0]) / 6)
+    for tick in step * np.arange(np.ceil(x[0] / step - 1e-9), np.floor(x[-1] / step + 1e-9) + 1):
+        parts.append(_text(to_x(tick), height - bottom + 18, f"{np.round(tick, 9) + 0.0:g}", "middle"))
     parts.append(_text((left + width) / 2, height - 2, x_label, "middle"))
-    path = "M" + "L".join(f"{to_x(a):.1f} {to_y(b):.1f}" for a, b in zip(x, y, strict=True))
+    path = "M" + "L".join(f"{to_x(a):.1f} {to_y(b):.1f}" for a, b in zip(x, tall, strict=True))
     parts.append(_line(to_x(mark_x), 10, to_x(mark_x), height - bottom, "var(--second)", 1.5))
     parts.append(
         f'<path d="{path}" fill="none" stroke="var(--accent)" stroke-width="2" stroke-linejoin="round"/>'
     )
-    return _svg(width, height, parts, "curve")
+    return _svg(width, height, parts, y_label)
 
 
 def overlay(image: NDArray[np.uint8], seen: Floats, predicted: Floats, level: int) -> str:

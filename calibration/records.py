@@ -268,6 +268,6 @@ class ObjectPoseRecord:
             result.covariance,
             result.rms_m,
             len(result.distance_m),
-            result.unobservable,
+            (*result.unobservable, *result.rivals),
             sources,
         )

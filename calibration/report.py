@@ -266,41 +266,34 @@ def _time_offset(result: TimeOffsetResult) -> str:
     order = np.argsort(result.speed_px_s)
     labels = [f"{result.speed_px_s[i]:.0f}" for i in order]
     apart = np.abs(1e3 * (result.frame_offset_s[order] - result.offset_s))
-    figures: list[str] = []
+    correlation: list[str] = []
     if result.correlation is not None:
-        told = np.isfinite(result.correlation.correlation)
-        figures.append(
+        tried, found = result.correlation.offset_s, result.correlation.correlation
+        correlation = [
             html.figure(
-                plots.curve(
-                    result.correlation.offset_s[told],
-                    result.correlation.correlation[told],
-                    result.offset_s,
-                    "offset tried, s",
-                    "correlation",
-                ),
-                "Correlation of how fast camera and arm turn, before any calibration is used.",
-                12,
+                plots.correlation_curve(tried, found, result.offset_s, "offset tried, s"),
+                "How alike camera and arm turn, before any calibration is used; the line marks the estimate.",
+                4,
             )
-        )
+        ]
     return html.section(
         "Time offset",
-        "The board stands still, so the delay between camera and arm is the one that makes it stand still"
-        " in the"
-        " pictures. The curve must have one deep minimum.",
+        "The board stands still, so the delay between camera and arm is the one that makes it stand still in"
+        " the pictures. The curve must have one deep minimum.",
         html.grid(
             html.figure(
                 plots.curve(
                     result.scan_s, result.scan_px, result.offset_s, "offset tried, s", "median error, px"
                 ),
                 "Corner error over the offset; the line marks the estimate.",
-                6,
+                4 if correlation else 6,
             ),
+            *correlation,
             html.figure(
                 plots.bars(apart, ~result.used[order], labels, "ms"),
                 "How far each frame alone is from the estimate; frames by corner speed, px/s.",
-                6,
+                4 if correlation else 6,
             ),
-            *figures,
         ),
         html.tiles(
             html.Tile(

@@ -76,7 +76,10 @@ def object_section(name: str, touched: TouchedObject) -> str:
     return html.section(
         f"Object: {name}",
         "Touched points on the mesh in its fitted pose; green lies within half a millimetre of the surface.",
-        *(html.note(f"The touched points leave open: {words}.") for words in result.unobservable),
+        *(
+            html.note(f"The touched points leave open: {words}.")
+            for words in (*result.unobservable, *result.rivals)
+        ),
         html.grid(
             html.figure(sketch, "Touched points on the object.", 5),
             html.figure(

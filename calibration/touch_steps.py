@@ -134,12 +134,12 @@ def _fused(
         symmetry_axis,
     )
     points = np.array([len(r.distance_m) for r in results])
-    left_open = [words for words in first.unobservable if all(words in r.unobservable for r in results)]
+    left_open = [w for w in results[0].unobservable if all(w in r.unobservable for r in results)]
     return replace(
         first,
         T_base_obj=fused.pose,
         covariance=fused.covariance + tip,
         rms_m=float(np.sqrt(np.average([r.rms_m**2 for r in results], weights=points))),
         points=int(points.sum()),
-        unobservable=tuple(left_open),
+        unobservable=(*left_open, *results[0].rivals),  # the others were sought about the first
     )

@@ -128,7 +128,15 @@ def tool_tip_from_session(session: Session) -> ToolTipResult:
     _, trace = arm_trace(session)
     assert session.robot is not None
     rests = [rest.T_base_tcp for rest in find_rests(session.robot)]
-    return calibrate_tool_tip(SE3.stack(rests) if len(rests) >= MIN_POSES else _thinned(trace))
+    if len(rests) >= MIN_POSES:
+        return calibrate_tool_tip(SE3.stack(rests))
+    try:
+        return calibrate_tool_tip(_thinned(trace))
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"{error} (the arm was held still {len(rests)} times, fewer than {MIN_POSES}, so the whole way"
+            " was taken)"
+        ) from error
 
 
 def _thinned(trace: SE3) -> SE3:

@@ -106,6 +106,13 @@ def test_a_trace_without_rests_is_swung_about_the_tip_too(tmp_path):
     assert record.poses > 10
 
 
+def test_too_few_tilts_are_counted(tmp_path):
+    rotation = down(np.array([[0.4, 0, 0], [0, 0.4, 0], [-0.4, 0, 0.2], [0, -0.4, 0]]))
+    path = guided(tmp_path / "few.h5", "tool_tip", SE3(rotation, [0.4, 0, 0.05] - rotation @ TIP))
+    with pytest.raises(CalibrationError, match="held still 4 times, fewer than 6"):
+        add_tool_tip(path, tmp_path / "calibration.json")
+
+
 def test_sessions_that_are_something_else_are_refused(tilted, tmp_path):
     calibration = tmp_path / "calibration.json"
     touches = touched(tmp_path / "touches.h5", 1)

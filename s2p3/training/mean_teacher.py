@@ -4,12 +4,16 @@ Valpola 2017), as the text of Self6D++ has it. The paper's teacher is frozen, an
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from s2p3.networks.teacher import Teacher, TeacherOutput
 from s2p3.training.loop import update_average
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 class MeanTeacher(nn.Module):

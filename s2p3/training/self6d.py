@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from dataset.errors import ToolkitError
 from s2p3 import appearance_losses as appearance
@@ -43,6 +43,9 @@ from s2p3.training.self_supervised import (
     enlarged,
     load_pair,
 )
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 def self_supervise_rgbd(

@@ -27,8 +27,17 @@ def test_the_paper_preset_holds_the_papers_values() -> None:
     weights = paper.self_supervision
     assert weights.pose_weight == weights.mask_weight == 1
     assert weights.normals_weight == weights.physics_weight == 1
-    assert weights.physics == "dolp"
+    assert (weights.physics, weights.teacher, weights.depth) == ("dolp", "frozen", "none")
+    assert (paper.input.modality, paper.network.student) == ("polarization", "direct")
     assert paper.teacher.dense_weight == 0
+
+
+def test_the_baseline_has_the_published_weights() -> None:
+    baseline = config.paper().self6d
+    assert (baseline.epochs, baseline.batch, baseline.learning_rate) == (100, 6, 1e-4)
+    assert (baseline.schedule, baseline.clip_norm) == ("flat", 1.0)
+    assert (baseline.pose_weight, baseline.mask_weight, baseline.chamfer_weight) == (10, 1, 100)
+    assert (baseline.colour_weight, baseline.structure_weight, baseline.perceptual_weight) == (0.2, 1, 0.15)
 
 
 def test_an_unknown_field_is_named_with_the_nearest_valid_one(tmp_path: Path) -> None:

@@ -157,6 +157,7 @@ def browser_page(address: Address) -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=_CHROMIUM, args=list(_SOFTWARE_WEBGL))
         page = browser.new_page(viewport=_SIZE)
+        page.set_default_timeout(180_000)  # WebGL in software, beside a lab on the same machine
         page.goto(address.url)
         notice = page.locator(".mantine-Notification-closeButton")
         notice.first.click(timeout=60_000)

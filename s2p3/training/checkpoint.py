@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 from dataclasses import asdict, dataclass
@@ -130,7 +131,7 @@ def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:
     """Writes a safetensors file atomically: a reader sees the old file or the new one."""
-    temporary = path.with_name(path.name + ".part")
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")  # several processes may write the same
     save_file({name: tensor.detach().contiguous() for name, tensor in tensors.items()}, temporary, metadata)
     temporary.replace(path)
 

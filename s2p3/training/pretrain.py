@@ -30,9 +30,9 @@ from s2p3.training.checkpoint import CheckpointInfo, Kind, Validation
 from s2p3.training.crops import content_hashes
 from s2p3.training.examples import CropSource, Examples
 from s2p3.training.loop import Forward, Losses, Objective, Score, optimize
+from s2p3.training.physics_signal import labelled_signal, report_signal
 from s2p3.training.progress import OnStep
 from s2p3.training.scoring import PoseScorer
-from s2p3.training.signal import labelled_signal, report_signal
 
 Stage = Literal["pretrained", "supervised"]
 ALL_FRAMES = FrameSource()
@@ -133,7 +133,8 @@ class Pretraining:
         if examples.held_out is not None:
             scorer = PoseScorer(examples.held_out, self.model, self.config)
             score = Score(scorer.name, scorer, self.settings.validations)
-        fingerprint = f"{self.hashes} {self.config} {self.model.name} {examples.origin}"
+        rows = examples.rows.tolist()
+        fingerprint = f"{self.hashes} {self.config} {self.model.name} {rows} {examples.origin}"
         trained = optimize(
             network,
             data,

@@ -38,6 +38,7 @@ COMMANDS = {
     "loader-256": "loader.py --size 256 --json",
     "session-open": "session_open.py --json",
     "inference": "inference.py --json",
+    "training": "training.py --json",
 }
 """What is published, in the page's order."""
 

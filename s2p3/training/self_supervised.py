@@ -30,10 +30,10 @@ from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
 from s2p3.training.loop import Forward, Losses, optimize
 from s2p3.training.mean_teacher import MeanTeacher
+from s2p3.training.physics_signal import captured_signal, report_signal
 from s2p3.training.pretrain import load_student, load_teacher, model_tensors
 from s2p3.training.progress import OnStep
 from s2p3.training.pseudo_labels import PseudoLabels, carry_labels, labels_of, make_labels, pooled_maps
-from s2p3.training.signal import captured_signal, report_signal
 
 _BATCH_NORM_MOMENTUM = 0.02
 

@@ -29,9 +29,9 @@ from s2p3.rendering.differentiable import RenderMesh
 from s2p3.synthesis.informativeness import Informativeness
 from s2p3.training import Crops, captured_crops, checkpoint, labelled_crops, self_supervise
 from s2p3.training.mean_teacher import MeanTeacher
+from s2p3.training.physics_signal import captured_signal, labelled_signal, objection, report_signal
 from s2p3.training.pseudo_labels import labels_of, make_labels
 from s2p3.training.self6d import self_supervise_rgbd
-from s2p3.training.signal import captured_signal, labelled_signal, objection, report_signal
 from tests.s2p3.untrained import save_untrained
 
 pytestmark = pytest.mark.filterwarnings("ignore::dataset.errors.ToolkitWarning")

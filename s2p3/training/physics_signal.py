@@ -7,6 +7,7 @@ the signal. A set without signal can be trained on; but then L_physics cannot he
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -71,7 +72,10 @@ def objection(figures: Informativeness) -> str | None:
 
 
 def report_signal(figures: Informativeness, beside: Path) -> None:
-    """Keeps the figures as NAME.signal.json beside a checkpoint to be, and warns where they say nothing."""
+    """Keeps the figures as NAME.signal.json beside a checkpoint to be, and warns where they say nothing. Of
+    several processes that train together the first one does."""
+    if int(os.environ.get("RANK", "0")):
+        return
     beside.parent.mkdir(parents=True, exist_ok=True)
     beside.with_suffix(".signal.json").write_text(figures.to_json() + "\n", encoding="utf-8")
     problem = objection(figures)

@@ -7,25 +7,30 @@ there. Beside the session come its manifest and a picture of how informative it 
 
 from __future__ import annotations
 
-import json
-import shutil
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dataset import SE3, CameraInfo, Intrinsics, RawFrame, SessionError, ToolkitError
-from dataset.session import Chunk, ObjectPoses, SessionWriter, write_object, write_poses
+from dataset.session import (
+    Chunk,
+    ObjectPoses,
+    PackedMasks,
+    SessionWriter,
+    check_name,
+    write_object,
+    write_poses,
+)
 from s2p3.objects import ObjectModel
 from s2p3.synthesis.analytic_scene import Analytic
 from s2p3.synthesis.domain import SYNTHETIC, Domain
 from s2p3.synthesis.executors import Executor, rendered
 from s2p3.synthesis.frames import BITS, Part, Recipe
 from s2p3.synthesis.informativeness import Informativeness
-from s2p3.synthesis.manifest import request_of, write_manifest
+from s2p3.synthesis.manifest import beside, request_of, write_manifest
+from s2p3.synthesis.parts import Parts
 from s2p3.synthesis.scene import Backend
 
 
@@ -59,66 +64,28 @@ def synthesize(
         How much the set says about shape, measured on its first frames.
 
     Raises:
-        ToolkitError: `out` exists, the object cannot be seen in these views, or backend or executor are not
-            installed.
+        ToolkitError: `out` exists, another process is at it or it was begun otherwise, the object cannot be
+            seen in these views or has no name for a session, or backend or executor are not installed.
     """
     out = Path(out)
     if out.exists():
         raise SessionError(f"{out} exists; remove it or choose another name")
     if count < 1:
         raise ToolkitError(f"{out}: a set needs at least one frame, not {count}")
+    check_name(model.name)
     recipe = Recipe(model, intrinsics.pinhole, domain, backend or Analytic(), seed)
-    folder = out.with_name(out.name + ".parts")
-    _prepare(folder, recipe)
-    missing = [index for index in range(count) if not _part(folder, index).exists()]
-    for done, (index, part) in enumerate(
-        rendered(recipe, missing, workers, executor), start=count - len(missing) + 1
-    ):
-        _store(_part(folder, index), part)
-        if on_progress is not None:
-            on_progress(done, count)
-    figures = _assemble(recipe, folder, count, out)
-    shutil.rmtree(folder)
-    return figures
+    with Parts.of(out, request_of(recipe)) as parts:
+        missing = parts.missing(count)
+        for done, (index, part) in enumerate(
+            rendered(recipe, missing, workers, executor), start=count - len(missing) + 1
+        ):
+            parts.store(index, part)
+            if on_progress is not None:
+                on_progress(done, count)
+        return _assemble(recipe, parts, count, out)
 
 
-def _prepare(folder: Path, recipe: Recipe) -> None:
-    """Keep an interrupted set's frames only if they are of this very set."""
-    request = json.dumps(request_of(recipe), indent=1)
-    kept = folder / "request.json"
-    if kept.exists() and kept.read_text() == request:
-        return
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    kept.write_text(request)
-
-
-def _part(folder: Path, index: int) -> Path:
-    return folder / f"{index:06d}.npz"
-
-
-def _store(path: Path, part: bytes) -> None:
-    unfinished = path.with_suffix(".tmp")
-    unfinished.write_bytes(part)
-    unfinished.rename(path)
-
-
-@dataclass(frozen=True, eq=False)
-class _Masks:
-    """Visible masks (n, h, w), packed to bits."""
-
-    packed: Sequence[NDArray[np.uint8]]
-    shape: tuple[int, int]
-
-    def __len__(self) -> int:
-        return len(self.packed)
-
-    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
-        bits = np.unpackbits(self.packed[index], count=self.shape[0] * self.shape[1])
-        return bits.reshape(self.shape).astype(bool)
-
-
-def _assemble(recipe: Recipe, folder: Path, count: int, out: Path) -> Informativeness:
+def _assemble(recipe: Recipe, parts: Parts, count: int, out: Path) -> Informativeness:
     """Write the session from its parts, under another name until it and all beside it are complete."""
     height, width = 2 * recipe.intrinsics.height, 2 * recipe.intrinsics.width
     matrix = recipe.intrinsics.K.copy()
@@ -126,14 +93,14 @@ def _assemble(recipe: Recipe, folder: Path, count: int, out: Path) -> Informativ
     matrix[:2, 2] += 0.5  # the working pixel's centre lies between the four pixels of its cell
     backend = recipe.backend.name
     camera = CameraInfo("s2p3", backend, f"seed {recipe.seed}", "", "Mono12", "mono", width, height, BITS, 0)
-    unfinished = folder / "session.h5"
+    unfinished = parts.folder / "session.h5"
     unfinished.unlink(missing_ok=True)
     poses, visible, boxes, masks, figures, entries = [], [], [], [], [], []
     pixels = np.broadcast_to(np.zeros((), np.uint16), (height, width))
     mosaic = Intrinsics(matrix, np.zeros(0), height, width)
     with SessionWriter(unfinished, "synthetic", camera, intrinsics=mosaic) as writer:
         for index in range(count):
-            part = Part(_part(folder, index))
+            part = Part(parts.path(index))
             now = time.monotonic_ns()
             frame = RawFrame(pixels, "Mono12", index, now, now, 1.0, 0.0, 0)
             writer.add_frame(frame, Chunk(part["chunk"].tobytes(), int(part["crc32"])))
@@ -146,10 +113,10 @@ def _assemble(recipe: Recipe, folder: Path, count: int, out: Path) -> Informativ
                 figures.append(part.figures)
     write_object(unfinished, recipe.model.to_record())
     shape = (recipe.intrinsics.height, recipe.intrinsics.width)
-    truth = ObjectPoses(SE3.stack(poses), np.array(visible), np.array(boxes), _Masks(masks, shape))
+    truth = ObjectPoses(SE3.stack(poses), np.array(visible), np.array(boxes), PackedMasks(masks, shape))
     write_poses(unfinished, SE3.identity((count,)), 0.0, 0.0, {recipe.model.name: truth})
     result = Informativeness.mean(figures)
     write_manifest(out, recipe, result, entries)
-    result.draw(out.with_suffix(".informativeness.png"), f"{recipe.model.name}, {backend}, {count} frames")
+    result.draw(beside(out, "informativeness.png"), f"{recipe.model.name}, {backend}, {count} frames")
     unfinished.rename(out)
     return result

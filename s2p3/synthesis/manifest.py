@@ -28,9 +28,15 @@ from s2p3.synthesis.scene import Backend, SceneImage
 from s2p3.synthesis.views import Views, ViewsLike
 
 
+def beside(session: str | Path, what: str) -> Path:
+    """Where something about a synthetic session lies: cup.manifest.json beside cup.h5."""
+    path = Path(session)
+    return path.with_name(f"{path.name.removesuffix('.h5')}.{what}")
+
+
 def manifest_path(session: str | Path) -> Path:
     """Where the manifest of a synthetic session lies."""
-    return Path(session).with_suffix(".manifest.json")
+    return beside(session, "manifest.json")
 
 
 def request_of(recipe: Recipe) -> dict[str, Any]:

@@ -76,9 +76,20 @@ def test_a_frame_that_would_come_out_otherwise_is_an_error(tmp_path: Path) -> No
         render_again(path, 0)
 
 
-def test_a_ray_cluster_renders_the_same_set(tmp_path: Path) -> None:
+def test_a_ray_cluster_of_two_nodes_renders_the_same_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each node has one CPU, and each of the two actors wants one: both nodes render."""
+    from ray.cluster_utils import Cluster  # takes seconds to import
+
     synthesize(CUP, 5, TINY, 4, tmp_path / "local.h5", domain=NEAR)
-    synthesize(CUP, 5, TINY, 4, tmp_path / "ray.h5", workers=2, domain=NEAR, executor="ray")
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        cluster.add_node(num_cpus=1)
+        monkeypatch.setenv("RAY_ADDRESS", cluster.address)
+        synthesize(CUP, 5, TINY, 4, tmp_path / "ray.h5", workers=2, domain=NEAR, executor="ray")
+    finally:
+        cluster.shutdown()
     np.testing.assert_array_equal(_raws(tmp_path / "local.h5"), _raws(tmp_path / "ray.h5"))
 
 
@@ -121,6 +132,68 @@ def test_a_set_whose_process_was_killed_goes_on_and_comes_out_the_same(tmp_path:
     assert done == list(range(len(kept) + 1, 13))
     synthesize(CUP, 12, camera, 5, tmp_path / "whole.h5")
     np.testing.assert_array_equal(_raws(out), _raws(tmp_path / "whole.h5"))
+
+
+def _interrupted(out: Path, count: int, seed: int) -> Path:
+    """The parts of a set that was stopped after two frames."""
+
+    def stop(done: int, _: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        synthesize(CUP, count, TINY, seed, out, domain=NEAR, on_progress=stop)
+    return out.with_name(out.name + ".parts")
+
+
+def test_a_set_goes_on_only_as_it_began(tmp_path: Path) -> None:
+    out = tmp_path / "set.h5"
+    parts = _interrupted(out, 3, 1)
+    with pytest.raises(ToolkitError, match="2 frames of a set that was begun with another domain and seed"):
+        synthesize(CUP, 3, TINY, 2, out)
+    with pytest.raises(ToolkitError, match="another backend"):
+        synthesize(CUP, 3, TINY, 1, out, domain=NEAR, backend=PathTraced(PathTraced.here().engine, 16))
+    assert len(list(parts.glob("*.npz"))) == 2
+    synthesize(CUP, 3, TINY, 1, out, domain=NEAR)
+    synthesize(CUP, 3, TINY, 1, tmp_path / "whole.h5", domain=NEAR)
+    np.testing.assert_array_equal(_raws(out), _raws(tmp_path / "whole.h5"))
+    assert not parts.exists()
+
+
+def test_a_frame_without_its_end_is_rendered_again(tmp_path: Path) -> None:
+    out = tmp_path / "set.h5"
+    parts = _interrupted(out, 3, 1)
+    whole = (parts / "000000.npz").read_bytes()
+    (parts / "000000.npz").write_bytes(whole[: len(whole) // 2])
+    (parts / "000001.npz").write_bytes(b"")
+    done: list[int] = []
+    synthesize(CUP, 3, TINY, 1, out, domain=NEAR, on_progress=lambda count, _: done.append(count))
+    assert done == [1, 2, 3]
+
+
+def test_two_processes_do_not_render_the_same_set(tmp_path: Path) -> None:
+    out = tmp_path / "set.h5"
+
+    def again(done: int, _: int) -> None:
+        with pytest.raises(ToolkitError, match="another process renders this set"):
+            synthesize(CUP, 2, TINY, 1, out, domain=NEAR)
+
+    synthesize(CUP, 2, TINY, 1, out, domain=NEAR, on_progress=again)
+    assert len(_raws(out)) == 2
+
+
+def test_a_name_that_no_session_takes_is_refused_before_anything_is_rendered(tmp_path: Path) -> None:
+    with pytest.raises(ToolkitError, match="may hold only letters"):
+        synthesize(replace(CUP, name="a/b"), 1, TINY, 1, tmp_path / "set.h5")
+    assert not list(tmp_path.iterdir())
+
+
+def test_sets_whose_names_differ_by_what_looks_like_a_suffix_keep_their_own_manifests(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        synthesize(CUP, 1, TINY, seed, tmp_path / f"cup.v{seed}", domain=NEAR)
+    for seed in (1, 2):
+        path = tmp_path / f"cup.v{seed}"
+        np.testing.assert_array_equal(render_again(path, 0)[1], _raws(path)[0])
 
 
 def test_a_worker_that_is_ended_is_told_in_one_line(tmp_path: Path) -> None:

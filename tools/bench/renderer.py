@@ -11,9 +11,8 @@ spanning two thirds of the image, as in a box enlarged by half:
                                          a mask rendered sixteen times finer, over `--views` random poses
     recovered_pct, recovered_add_pct     poses found again from 10 deg and 5 % of the diameter off: see
                                          `pose_recovery.recovered`
-
-and mitsuba_projective_ms_128: the time of Mitsuba's direct_projective for one mask of the first object and
-its gradient, 16 samples per pixel (--without-mitsuba leaves it out).
+    mitsuba_projective_ms_128            the peer: Mitsuba's direct_projective for one mask and its gradient,
+                                         16 samples per pixel (--without-mitsuba leaves it out)
 """
 
 from __future__ import annotations
@@ -101,7 +100,7 @@ def gradient_cosines(mesh: RenderMesh, diameter: float, count: int, size: int = 
 
 
 def measure(model: ObjectModel, count: int, rounds: int) -> dict[str, float]:
-    """The figures of the module's docstring, of one object."""
+    """The figures of the module's docstring, of one object, but for the peer's."""
     mesh = RenderMesh.from_mesh(model.mesh)
     passes = {str(size): forward_backward(mesh, model.diameter, size) for size in (128, 256)}
     times = in_turns(passes, rounds, clock=cpu_time)
@@ -138,18 +137,16 @@ def main() -> None:
     if min(options.views, options.rounds) < 1:
         parser.error("--views and --rounds count from 1")
     torch.set_num_threads(1)
-    figures: dict[str, dict[str, float] | float] = {}
+    figures = {}
     for name in options.objects:
-        row = {key: round(x, 3) for key, x in measure(build(name), options.views, options.rounds).items()}
-        figures[name] = row
+        model = build(name)
+        row = measure(model, options.views, options.rounds)
+        if not options.without_mitsuba:
+            peer = {"peer": mitsuba_projective.forward_backward(model)}
+            row["mitsuba_projective_ms_128"] = in_turns(peer, rounds=3, warm_up=1, clock=cpu_time)["peer"]
+        figures[name] = {key: round(x, 3) for key, x in row.items()}
         if not options.json:
             print(f"{name:8s}", *(f"{key} {x:.3f}" for key, x in row.items()), flush=True)
-    if not options.without_mitsuba:
-        peer = mitsuba_projective.forward_backward(build(options.objects[0]))
-        ms = in_turns({"peer": peer}, rounds=3, warm_up=1, clock=cpu_time)["peer"]
-        figures["mitsuba_projective_ms_128"] = round(ms, 1)
-        if not options.json:
-            print(f"mitsuba_projective_ms_128 {ms:.1f}")
     if options.json:
         print(json.dumps(figures))
 

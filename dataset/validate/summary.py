@@ -24,7 +24,8 @@ class SessionInfo:
         frames, drops: frames stored, and known to be missing.
         paused: frames taken while the recording was paused.
         segments: uninterrupted recordings that the file is made of.
-        duration_s: from the first to the last frame, host clock, seconds.
+        duration_s: from the first to the last frame, host clock, seconds; read from two places, so it is not
+            held against a checksum, as `validate` does.
         robot_samples: of the arm's trace.
         clocks: whose clock was fitted to the host's.
         calibrated, posed: whether a calibration and camera poses are stored.

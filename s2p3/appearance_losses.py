@@ -30,16 +30,15 @@ _AB_RANGE = 100.0
 _SOFT = 0.02  # masks are moved this far from 0 and 1, where the cross entropy is infinite
 
 
-def shaded(normals: Tensor, rays: Tensor, mask: Tensor) -> Tensor:
+def shaded(normals: Tensor, rays: Tensor) -> Tensor:
     """What a white matt object looks like, lit from the camera (B, 3, h, w): the rendering of an object
     without texture (our choice).
 
     Args:
-        normals, rays: (B, 3, h, w), unit.
-        mask: (B, 1, h, w) of the rendering.
+        normals: (B, 3, h, w) rendered, unit, zero outside the object.
+        rays: (B, 3, h, w) unit viewing rays.
     """
-    facing = (-(normals * rays).sum(1, keepdim=True)).clamp(0, 1)
-    return (facing * mask).expand(-1, 3, -1, -1)
+    return (-(normals * rays).sum(1, keepdim=True)).clamp(0, 1).expand(-1, 3, -1, -1)
 
 
 def exposed_like(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:

@@ -145,7 +145,7 @@ class _Objective:
         """Colour, structure and, with weights for it, perceptual distance, inside the predicted mask."""
         captured = (seen.stokes[:, :1] / 2).clamp(0, 1).expand(-1, 3, -1, -1)
         rays = physics.pixel_rays(seen.K, seen.size, seen.size)
-        drawn = appearance.shaded(rendered.normals, rays, rendered.mask)
+        drawn = appearance.shaded(rendered.normals, rays)
         drawn = appearance.exposed_like(drawn, captured, inside * rendered.mask)
         terms = {
             "colour": appearance.colour_loss(drawn, captured, inside).mean(),

@@ -75,7 +75,7 @@ def test_a_white_sphere_is_brightest_in_the_middle() -> None:
     normals = torch.nn.functional.normalize(torch.tensor([[0.0, 0, -1], [1.0, 0, -1]]), dim=1)
     normals = normals.T.reshape(1, 3, 1, 2)
     rays = torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1).expand(-1, -1, -1, 2)
-    image = appearance.shaded(normals, rays, torch.ones(1, 1, 1, 2))
+    image = appearance.shaded(normals, rays)
     torch.testing.assert_close(image[0, :, 0], torch.tensor([1, math.sqrt(0.5)]).expand(3, -1))
     bright = appearance.exposed_like(image, 0.3 * image, torch.ones(1, 1, 1, 2))
     torch.testing.assert_close(bright, 0.3 * image)

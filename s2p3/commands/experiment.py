@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 
 from acquisition import typed_toml
+from dataset.errors import ToolkitError
 from s2p3.config import (
     PRESETS,
     AugmentationConfig,
@@ -97,10 +98,7 @@ Verb = TypeVar("Verb", bound=Callable[..., Any])
 
 def with_defaults(verb: Verb, words: Sequence[str]) -> Verb:
     """A verb whose `experiment` has the values of the preset, file or checkpoint named in the words after it;
-    other verbs as they are.
-
-    Raises ToolkitError: the file cannot be read.
-    """
+    other verbs as they are."""
     parameter = inspect.signature(verb).parameters.get("experiment")
     if parameter is None:
         return verb
@@ -115,17 +113,17 @@ def named_in(words: Sequence[str]) -> ExperimentConfig:
     for name in ("--preset", "--config", "--student"):
         parser.add_argument(name, nargs="?")
     found, _ = parser.parse_known_args(list(words))
-    if found.config is not None:
-        return load(found.config)
-    if found.student is not None:
-        return _of_checkpoint(Path(found.student))
+    try:
+        if found.config is not None:
+            return load(found.config)
+        if found.student is not None:
+            return _of_checkpoint(Path(found.student))
+    except (ToolkitError, OSError, ValueError, KeyError, TypeError):
+        return _FAST
     return PRESETS.get(found.preset or "fast", PRESETS["fast"])()
 
 
 def _of_checkpoint(path: Path) -> ExperimentConfig:
     """What a network was trained with; read without torch."""
-    try:
-        text = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["config"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return PRESETS["fast"]()
+    text = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["config"]
     return typed_toml.loads(ExperimentConfig, text, source=str(path))

@@ -32,7 +32,7 @@ from s2p3.commands.experiment import (
     experiment_of,
 )
 from s2p3.commands.output import say, show
-from s2p3.config import FrameSource
+from s2p3.config import FrameSource, load
 
 if TYPE_CHECKING:
     from s2p3.config import ExperimentConfig
@@ -229,7 +229,8 @@ def train_self_supervised(
         threads: CPU threads of the network.
         workers: processes that augment, a thread each; 0: the training does it itself.
     """
-    del config  # with_defaults has read it
+    if config is not None:
+        load(config)  # its values are the options' defaults; here its mistakes are told
     from s2p3.learning import adapt
     from s2p3.objects import named_object
 

@@ -42,6 +42,7 @@ from s2p3.training.self_supervised import (
     clouds,
     enlarged,
     load_pair,
+    visible_surface,
 )
 
 if TYPE_CHECKING:
@@ -128,6 +129,7 @@ class _Objective:
         output = pose_of(forward(seen.polarization, seen.priors))
         rotation, translation, _ = decode_pose(output, seen.K, seen.size, self.diameter_m)
         rendered = render(self.mesh, rotation, translation, seen.K, seen.size, seen.size)
+        surface = visible_surface(self.mesh, rotation, translation, seen)
         inside = (enlarged(target.mask) > 0.5).float()
         pose = (target.rotation, target.translation)
         distance = losses.pose_loss(self.points, rotation, translation, *pose, self.symmetries)
@@ -135,7 +137,7 @@ class _Objective:
         terms = {
             "pose": distance.mean() / self.diameter_m,
             "mask": appearance.mask_entropy(pooled_maps(rendered)[0], target.mask).mean(),
-            "chamfer": losses.chamfer_loss(*clouds(seen, rendered, inside), limit_m=limit).mean(),
+            "chamfer": losses.chamfer_loss(*clouds(seen, surface, inside), limit_m=limit).mean(),
             **self._appearance(seen, rendered, inside),
         }
         weights = {name: getattr(settings, f"{name}_weight") for name in terms}

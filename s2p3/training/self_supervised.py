@@ -183,7 +183,8 @@ class _Objective:
         if settings.physics != "none":
             terms["physics"] = self._physics(seen, rendered, target.mask).mean()
         if settings.depth != "none":
-            terms["depth"] = self._depth(seen, rendered, target.mask).mean() / self.diameter_m
+            surface = visible_surface(self.mesh, rotation, translation, seen)
+            terms["depth"] = self._depth(seen, surface, target.mask).mean() / self.diameter_m
         weights = {name: getattr(settings, f"{name}_weight") for name in terms}
         return {"total": torch.stack([weights[name] * terms[name] for name in terms]).sum(), **terms}
 
@@ -219,13 +220,13 @@ class _Objective:
             self.refractive_index,
         )
 
-    def _depth(self, seen: NetworkInput, rendered: RenderOutput, predicted_mask: Tensor) -> Tensor:
+    def _depth(self, seen: NetworkInput, surface: RenderOutput, predicted_mask: Tensor) -> Tensor:
         """The losses of the paper's depth ablation, metres, on what is measured in the predicted mask."""
         assert seen.depth is not None
         inside = (enlarged(predicted_mask) > 0.5).float()
         if self.settings.depth == "pixel":
-            return losses.depth_loss(rendered.depth, seen.depth, inside)
-        return losses.chamfer_loss(*clouds(seen, rendered, inside))
+            return losses.depth_loss(surface.depth, seen.depth, inside)
+        return losses.chamfer_loss(*clouds(seen, surface, inside))
 
 
 def enlarged(maps: Tensor) -> Tensor:
@@ -233,11 +234,19 @@ def enlarged(maps: Tensor) -> Tensor:
     return F.interpolate(maps, scale_factor=float(MAP_STRIDE), mode="bilinear")
 
 
-def clouds(seen: NetworkInput, rendered: RenderOutput, inside: Tensor) -> tuple[Tensor, Tensor]:
-    """Measured points inside a mask, and the points rendered at the student's pose, each (B, n, 3)."""
+def visible_surface(
+    mesh: RenderMesh, rotation: Tensor, translation: Tensor, seen: NetworkInput
+) -> RenderOutput:
+    """The object at the student's pose, for losses per visible pixel: a depth has no outline to move."""
+    return render(mesh, rotation, translation, seen.K, seen.size, seen.size, silhouette=False)
+
+
+def clouds(seen: NetworkInput, surface: RenderOutput, inside: Tensor) -> tuple[Tensor, Tensor]:
+    """Measured points inside a mask, and points of the visible surface, each (B, n, 3)."""
     assert seen.depth is not None
     measured = losses.back_project(seen.depth, inside, seen.K, losses.CLOUD_POINTS)
-    return measured, losses.back_project(rendered.depth, rendered.mask.detach(), seen.K, losses.CLOUD_POINTS)
+    drawn = losses.back_project(surface.depth, surface.mask, seen.K, losses.CLOUD_POINTS)
+    return measured, drawn
 
 
 def _following(pair: Pair, path: Path, settings: SelfSupervisionConfig) -> MeanTeacher:

@@ -19,7 +19,9 @@ from dataset.errors import ToolkitError, ToolkitWarning
 from dataset.session import Session, mask_box
 from dataset.session.edit import write_depth
 from s2p3 import config as presets
+from s2p3 import losses
 from s2p3.config import ExperimentConfig, SelfSupervisionConfig
+from s2p3.inputs import View
 from s2p3.networks.build import build_student, build_teacher
 from s2p3.networks.detector import Detection
 from s2p3.networks.teacher import Teacher, TeacherOutput
@@ -28,10 +30,12 @@ from s2p3.rendering import rasterize
 from s2p3.rendering.differentiable import RenderMesh
 from s2p3.synthesis.informativeness import Informativeness
 from s2p3.training import Crops, captured_crops, checkpoint, labelled_crops, self_supervise
+from s2p3.training.batches import form_input
 from s2p3.training.mean_teacher import MeanTeacher
 from s2p3.training.physics_signal import captured_signal, labelled_signal, objection, report_signal
 from s2p3.training.pseudo_labels import labels_of, make_labels
 from s2p3.training.self6d import self_supervise_rgbd
+from s2p3.training.self_supervised import clouds, visible_surface
 from tests.s2p3.untrained import save_untrained
 
 pytestmark = pytest.mark.filterwarnings("ignore::dataset.errors.ToolkitWarning")
@@ -189,9 +193,6 @@ def test_labels_made_over_all_crops_are_those_of_each_batch(cup_session: Path, c
         torch.zeros(1, 3, 16, 16),
         torch.zeros(1, 3, 16, 16),
     )
-    from s2p3.inputs import View
-    from s2p3.training.batches import form_input
-
     seen = form_input(crops, torch.tensor([0]), View.centred(1, 1.4), 1.5, config)
     said = labels_of(output, seen, mesh, cup.diameter)
     covered = said.rendered_mask.mean()
@@ -289,6 +290,29 @@ def test_depth_is_cut_on_the_grid_of_the_crops(with_depth: Path, cup: ObjectMode
     error = (z - crops.depth[:, 0].float())[covered].abs()
     assert error.median() < 0.002
     assert (error < 0.01).float().mean() > 0.9
+
+
+@pytest.mark.parametrize("depth", ["chamfer", "pixel"])
+def test_depth_losses_pull_an_object_that_is_too_far_nearer(
+    depth: Literal["chamfer", "pixel"], with_depth: Path, cup: ObjectModel
+) -> None:
+    config = tiny()
+    crops = labelled_crops([with_depth], cup, config.input, on_step=silent)
+    mesh, rows = RenderMesh.from_mesh(cup.mesh), torch.arange(2)
+    seen = form_input(crops, rows, View.centred(2, 1.4), 1.5, config)
+    assert seen.depth is not None
+    inside = (seen.depth > 0).float()
+    for wrong in (0.02, -0.02):
+        shift = torch.zeros(2, 3, requires_grad=True)
+        away = crops.translation[rows] * (1 + wrong)
+        surface = visible_surface(mesh, crops.rotation[rows], away + shift, seen)
+        if depth == "pixel":
+            loss = losses.depth_loss(surface.depth, seen.depth, inside)
+        else:
+            loss = losses.chamfer_loss(*clouds(seen, surface, inside))
+        (gradient,) = torch.autograd.grad(loss.sum(), shift)
+        assert (gradient[:, 2] * wrong > 0).all()
+        assert (gradient[:, 2].abs() < 3).all()  # metres per metre: nothing of an outline that moves
 
 
 def test_networks_that_see_depth_want_it(cup_session: Path, with_depth: Path, cup: ObjectModel) -> None:

@@ -11,7 +11,7 @@ named, since no package ships them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -90,7 +90,8 @@ def self_supervise_rgbd(
         workers=workers,
         on_step=on_step,
     )
-    info = CheckpointInfo.of("student", "self-supervised", model, trained.step, pair.config, hashes)
+    config = replace(pair.config, self6d=settings)
+    info = CheckpointInfo.of("student", "self-supervised", model, trained.step, config, hashes)
     checkpoint.save(path, trained.network.network.state_dict(), info)
     return path
 

@@ -7,7 +7,7 @@ was there. No pose of a captured frame is an argument, so none can be used.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -101,7 +101,8 @@ def self_supervise(
         on_step=on_step,
     )
     kept = trained.network.student if isinstance(trained.network, MeanTeacher) else trained.network
-    info = CheckpointInfo.of("student", "self-supervised", model, trained.step, pair.config, hashes)
+    config = replace(pair.config, self_supervision=settings)
+    info = CheckpointInfo.of("student", "self-supervised", model, trained.step, config, hashes)
     checkpoint.save(path, kept.state_dict(), info)
     return path
 

@@ -129,7 +129,10 @@ def test_the_total_is_the_weighted_sum_of_the_terms(
     assert all(last[name] > 0 for name in terms)
     total = sum(getattr(tiny().self_supervision, f"{name}_weight") * last[name] for name in terms)
     assert last["total"] == pytest.approx(total, rel=1e-5)
-    assert checkpoint.read_info(out, "student", "cup").stage == "self-supervised"
+    info = checkpoint.read_info(out, "student", "cup")
+    assert info.stage == "self-supervised"
+    kept = info.config.self_supervision  # what was used, not what the student was pre-trained with
+    assert all(getattr(kept, name) == value for name, value in changes.items())
 
 
 def test_a_depth_loss_without_depth_is_refused(

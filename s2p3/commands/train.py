@@ -176,6 +176,8 @@ def train_supervised(
 ) -> None:
     """Train on annotated captured frames, as on synthetic ones: the upper bound that needs annotations.
 
+    Frames are those of the split train, unless --split names another.
+
     Args:
         sessions: annotated sequences.
         object: cup, fork, knife, bottle, or the name of the object in --mesh.

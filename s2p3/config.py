@@ -126,6 +126,10 @@ class SupervisedConfig(StageConfig):
     holdout: float = 0.1
     """Share of the frames kept for that, where no others are named."""
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.holdout < 1:
+            raise ToolkitError(f"holdout {self.holdout:g} is no share below one; give 0.1, or 0 for none")
+
 
 @dataclass(frozen=True)
 class PretrainConfig(SupervisedConfig):
@@ -294,7 +298,7 @@ def paper() -> ExperimentConfig:
             adapt_batches=0,
             adapt_teacher=False,
         ),
-        self6d=Self6DConfig(epochs=100, batch=6, learning_rate=1e-4),
+        self6d=Self6DConfig(epochs=100, batch=6, learning_rate=1e-4, ema=0.0),
     )
 
 

@@ -35,7 +35,7 @@ class CpuRender(torch.autograd.Function):
         batch, dtype = len(pose[0]), pose[0].dtype
         face = np.empty((batch, *size), np.int32)
         images = tuple(np.zeros((batch, channels, *size), dtype) for channels in (1, 3, 1, 3))
-        draw_batch(*project(arrays[0], *pose), arrays[1], face)
+        draw_batch(arrays[0], *pose, arrays[1], face)
         _forward(*pose, *arrays[2:], face, *images)
         ctx.kernel = (pose, arrays[2:], step, face, images)
         mask, normals, depth, nocs = (torch.from_numpy(image) for image in images)
@@ -60,28 +60,25 @@ MeshArrays = tuple[Array, Array, Array, Array, Array]
 """Vertices (V, 3), faces (F, 3), table (F, 18), lower (3,), extent (3,): `RenderMesh` as arrays."""
 
 
-def project(vertices: Array, R: Array, t: Array, K: Array) -> tuple[Array, Array]:
-    """Vertices (V, 3) under B poses -> float64 pixels (B, V, 2) and depths (B, V); pixels of depth <= 0 mean
-    nothing."""
-    points = vertices.astype(np.float64) @ R.transpose(0, 2, 1).astype(np.float64) + t[:, None]
-    depths = np.ascontiguousarray(points[..., 2])
-    plane = points[..., :2] / np.where(depths > 0, depths, 1.0)[..., None]
-    return plane * K[:, None, [0, 1], [0, 1]] + K[:, None, :2, 2], depths
-
-
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def draw_batch(
-    pixels: NDArray[np.float64],
-    depths: NDArray[np.float64],
-    faces: NDArray[np.int32],
-    face_id: NDArray[np.int32],
+    vertices: Array, R: Array, t: Array, K: Array, faces: NDArray[np.int32], face_id: NDArray[np.int32]
 ) -> None:
-    """The visible face (B, H, W), -1 where there is none, of one mesh at B poses."""
+    """The visible face (B, H, W), -1 where there is none, of one mesh (V, 3), (F, 3) at B poses."""
+    pixels, depths = np.empty((len(vertices), 2)), np.empty(len(vertices))
     inverse_depth = np.empty(face_id.shape[1:], np.float32)
     face_id[:] = -1
     for b in range(face_id.shape[0]):
+        rotation, shift, camera = R[b].astype(np.float64), t[b].astype(np.float64), K[b].astype(np.float64)
+        for v in range(len(vertices)):
+            x, y, z = turn(rotation, vertices[v, 0], vertices[v, 1], vertices[v, 2])
+            z += shift[2]
+            depths[v] = z
+            scale = 1.0 / z if z > 0 else 1.0  # behind the camera, the pixel means nothing
+            pixels[v, 0] = camera[0, 0] * (x + shift[0]) * scale + camera[0, 2]
+            pixels[v, 1] = camera[1, 1] * (y + shift[1]) * scale + camera[1, 2]
         inverse_depth[:] = 0.0
-        draw_faces(pixels[b], depths[b], faces, face_id[b], inverse_depth)
+        draw_faces(pixels, depths, faces, face_id[b], inverse_depth)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from s2p3.rendering.boundary_kernels import CREASE_COSINE, RIM_PX
-from s2p3.rendering.cpu_kernels import draw_batch, project
+from s2p3.rendering.cpu_kernels import draw_batch
 from s2p3.rendering.render_mesh import RenderMesh, RenderOutput
 
 DEPTH_STEP = 0.03
@@ -254,5 +254,5 @@ def _visible_faces(mesh: RenderMesh, R: Tensor, t: Tensor, K: Tensor, height: in
     """(B, H, W) int64 index of the visible face, -1 where there is none; drawn on the CPU."""
     faces = np.empty((R.shape[0], height, width), np.int32)
     vertices, triangles = mesh.arrays()[:2]
-    draw_batch(*project(vertices, *(x.detach().cpu().numpy() for x in (R, t, K))), triangles, faces)
+    draw_batch(vertices, *(x.detach().cpu().numpy() for x in (R, t, K)), triangles, faces)
     return torch.from_numpy(faces).to(R.device, torch.int64)

@@ -56,14 +56,15 @@ def trefoil(sections: int = 240, sides: int = 20) -> tuple[np.ndarray, np.ndarra
 
 
 def forward_backward(mesh: RenderMesh, diameter: float, size: int) -> Callable[[], None]:
-    """One forward and backward pass of everything the renderer gives."""
+    """One forward and backward pass of everything the renderer gives, as from a loss of every map."""
     R, t, K = views(diameter, BATCH, SEED, size)
-    weights = torch.randn(BATCH, 8, size, size, generator=torch.Generator().manual_seed(SEED))
+    generator = torch.Generator().manual_seed(SEED)
+    gradients = [torch.randn(BATCH, channels, size, size, generator=generator) for channels in (1, 3, 1, 3)]
 
     def run() -> None:
         pose = R.clone().requires_grad_(), t.clone().requires_grad_()
         o = render(mesh, *pose, K, size, size)
-        (torch.cat([o.mask, o.normals, o.depth, o.nocs], dim=1) * weights).sum().backward()
+        torch.autograd.grad((o.mask, o.normals, o.depth, o.nocs), pose, gradients)
 
     return run
 

@@ -19,6 +19,7 @@ from calibration.bundle import (
     Observations,
     Solution,
     cross_matrix,
+    jackknife_variance,
     project_with_derivatives,
     solve,
 )
@@ -201,6 +202,15 @@ class Fit:
     def again(self, state: HandEyeState, observations: Observations) -> tuple[HandEyeState, Solution]:
         """The same fit to other views, with the noise levels found before."""
         return solve_with(state, observations, self.sigmas, self.free, self.information)
+
+    def jackknife_variance(self, observations: Observations, groups: int) -> Floats:
+        """(F,) variances of the free parameters when neighbouring views err alike."""
+        free = self.free
+        information = np.zeros((len(free), len(free))) if self.information is None else self.information
+        own_sigma = np.tile(self.sigmas.arm, (observations.view_count, 1))
+        return jackknife_variance(
+            self.state, observations, self.sigmas.pixel, own_sigma, free, information, groups
+        )
 
 
 def fit(

@@ -24,6 +24,7 @@ from dataset.transforms import SE3, interpolate_poses
 
 MIN_FRAMES = 8
 _SCAN_STEP_S = 0.01
+_STRETCHES = 10  # of a film, in which the arm goes a way or two (our choice)
 _SLOPE_SPAN_S = 0.02  # the arm's noise from one sample to the next must not pass for speed
 _MAX_SIGMA_S = 2e-3
 _EXACT = 1e-7
@@ -158,7 +159,11 @@ def _correlate(problem: _Problem, detections: list[Detection], spec: BoardSpec) 
 def _refined(
     problem: _Problem, offset: float, used: NDArray[np.bool_], T_base_board: SE3, covariance: Floats
 ) -> tuple[float, float]:
-    """The offset and its standard deviation, refined with both transforms and the noise levels."""
+    """The offset and its standard deviation, refined with both transforms and the noise levels.
+
+    How far off the arm is changes little from one frame to the next, and then the frames tell less than if
+    they erred each for itself: the larger of both estimates of the uncertainty is taken.
+    """
     state = HandEyeState(
         "eye_in_hand",
         problem.T_tcp_cam,
@@ -171,9 +176,12 @@ def _refined(
     free = state.free(offset=True)
     information = np.zeros((len(free), len(free)))
     information[TRANSFORMS, TRANSFORMS] = np.linalg.inv(covariance + _EXACT**2 * np.eye(len(covariance)))
-    found = fit(replace(state, expected=state), problem.observations.of_views(used), free, information)
+    observations = problem.observations.of_views(used)
+    found = fit(replace(state, expected=state), observations, free, information)
     place = int(np.count_nonzero(free[:SCALE]))  # after the transforms: the scale is not free
-    return found.state.offset_s, float(np.sqrt(found.solution.covariance[place, place]))
+    stretches = found.jackknife_variance(observations, min(_STRETCHES, observations.view_count // 2))
+    variance = max(float(found.solution.covariance[place, place]), float(stretches[place]))
+    return found.state.offset_s, float(np.sqrt(variance))
 
 
 @dataclass(frozen=True, eq=False)

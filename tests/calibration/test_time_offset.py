@@ -12,8 +12,9 @@ from dataset.transforms import SE3, translation_error_mm
 START_NS = 7_000_000_000_000
 
 
-def _swing(world, seed, offset_s, amplitude=1.0, frames=60, seconds=8.0):
-    """Frames at random times of a smooth motion, an arm at 500 Hz, camera times early by the offset."""
+def _swing(world, seed, offset_s, amplitude=1.0, frames=60, seconds=8.0, wander=0.0):
+    """Frames at random times of a smooth motion, an arm at 500 Hz, camera times early by the offset; the arm
+    may err by so many mm and mrad, smoothly over its workspace."""
     rng = np.random.default_rng(seed)
     size = amplitude * np.array([0.10, 0.08, 0.05, 0.12, 0.12, 0.2])
     rate = 2 * np.pi * np.array([0.23, 0.31, 0.17, 0.11, 0.19, 0.13])
@@ -26,7 +27,9 @@ def _swing(world, seed, offset_s, amplitude=1.0, frames=60, seconds=8.0):
 
     times = np.arange(0, seconds, 0.002)
     noise = rng.normal(0, 1, (len(times), 6)) * np.array([3e-5] * 3 + [5e-5] * 3)
-    trace = world.arm(T_cam_board(times)) @ SE3.exp(noise)
+    real = world.arm(T_cam_board(times))
+    wave = 1e-3 * wander * np.sin(2 * np.pi / 0.4 * real.translation)
+    trace = real @ SE3.exp(np.concatenate([wave, wave[:, [1, 2, 0]]], axis=1)) @ SE3.exp(noise)
     exposed = np.sort(rng.uniform(0.7, seconds - 0.7, frames))
     detections = [world.detection(pose, rng) for pose in T_cam_board(exposed)]
     host_mid_ns = START_NS + np.round((exposed - offset_s) * 1e9).astype(np.int64)
@@ -89,6 +92,16 @@ def test_refining_the_hand_eye_transform_with_the_offset_undoes_its_error(world)
     assert np.abs(joint).max() < 2e-4
     assert np.abs(joint).mean() < 0.5 * np.abs(alone).mean()
     assert np.all(np.abs(joint) < 4 * np.array(sigmas))
+
+
+def test_the_error_bar_holds_for_an_arm_that_errs_alike_from_frame_to_frame(world):
+    covariance = np.diag(([5e-5] * 3 + [1e-4] * 3) * 2) ** 2
+    scores = []
+    for seed in range(6):
+        recording = _swing(world, 60 + seed, 0.025, frames=40, wander=0.1)
+        result = _estimate(world, recording, None, covariance)
+        scores.append((result.offset_s - 0.025) / result.sigma_s)
+    assert 0.3 < np.sqrt(np.mean(np.square(scores))) < 1.25
 
 
 def test_two_streams_of_poses_give_offset_and_transforms_without_any_calibration(world):

@@ -254,5 +254,6 @@ def _visible_faces(mesh: RenderMesh, R: Tensor, t: Tensor, K: Tensor, height: in
     """(B, H, W) int64 index of the visible face, -1 where there is none; drawn on the CPU."""
     faces = np.empty((R.shape[0], height, width), np.int32)
     vertices, triangles = mesh.arrays()[:2]
-    draw_batch(vertices, *(x.detach().cpu().numpy() for x in (R, t, K)), triangles, faces)
+    rotation, shift, camera = (x.detach().cpu().numpy() for x in (R, t, K))
+    draw_batch(vertices, rotation, shift, camera, triangles, faces)
     return torch.from_numpy(faces).to(R.device, torch.int64)

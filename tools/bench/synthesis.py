@@ -52,8 +52,9 @@ def main() -> None:
     result = {
         "object": options.object,
         "seed": options.seed,
-        "backend": backend.describe(),
-        "timings": [asdict(one), asdict(two)],
+        "backend": ", ".join(f"{key} {value}" for key, value in backend.describe().items()),
+        "1 worker": asdict(one),
+        "2 workers": asdict(two),
         "cpu_s_per_set": one.cpu_s_per_set,
         "wall_s_per_set_2_workers": two.wall_s_per_set,
         "speedup_2_workers": speedup,

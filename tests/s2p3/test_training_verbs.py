@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
@@ -190,3 +191,22 @@ def test_an_annotated_split_is_trained_on_as_synthetic_sets_are(session: Path, t
     info = read_info(tmp_path / "teacher.safetensors", "teacher", "cup")
     assert (info.stage, info.step) == ("supervised", 1)
     assert presets.quick().teacher.steps != 1
+
+
+@pytest.mark.parametrize("modality", ["rgb", "rgbd"])
+def test_a_baseline_is_trained_and_predicts(
+    modality: str,
+    with_depth: Path,
+    networks: Networks,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    few = ["--config.student.steps", "1", "--config.student.batch", "2", "--config.student.validations", "0"]
+    words = ["train", "student", str(with_depth), "--object", "cup", *FEW, *few, "--out", str(tmp_path)]
+    assert main([*words, "--config.input.modality", modality]) == 0
+    trained = tmp_path / "student.safetensors"
+    assert read_info(trained, "student", "cup").config.input.modality == modality
+    capfd.readouterr()
+    chosen = ["--network", str(trained), "--detector", str(networks["detector"]), "--count", "1"]
+    assert main(["predict", str(with_depth), "--object", "cup", *chosen]) == 0
+    assert json.loads(capfd.readouterr().out)["found"]

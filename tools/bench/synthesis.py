@@ -5,7 +5,7 @@
 Renders the first frames with one worker and with two: light paths, denoising, sensor, compression, as
 `s2p3 synthesize` does. CPU seconds say what a frame costs on a machine that does other things, too; wall
 seconds want a quiet one. Starting (imports, the first kernels) is timed apart: it is paid once. "linearity"
-is the speed-up of two workers over two.
+is the speed-up of two workers over two; "minutes_for_400_on_2_workers" extrapolates, it is not a run of 400.
 """
 
 from __future__ import annotations

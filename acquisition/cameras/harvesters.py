@@ -30,7 +30,7 @@ PRODUCERS_VARIABLE = "GENICAM_GENTL64_PATH"
 _PRIVILEGE, _NOBODYS = "GevCCP", "OpenAccess"  # who controls a GigE Vision camera; one that restarted: nobody
 _BUFFERS = 12
 _OPEN_TIMEOUT_S = 20.0
-_CLOSE_TIMEOUT_S = 10.0
+_CLOSE_TIMEOUT_S = 20.0
 
 
 class HarvestersCamera(QueuedCamera):
@@ -63,11 +63,11 @@ class HarvestersCamera(QueuedCamera):
                 if harvester is not None:
                     harvester.reset()
 
-        # A producer may wait for seconds for a camera that is gone.
+        # A producer may wait for seconds for a camera that is gone, with Python's lock kept by genicam: to go
+        # on in between would win nothing, and until it is done nobody can open the camera again.
         thread = threading.Thread(target=let_go, name="let-go-of-camera", daemon=True)
         thread.start()
-        if not self._lost:
-            thread.join(_CLOSE_TIMEOUT_S)
+        thread.join(_CLOSE_TIMEOUT_S)
 
     def _open(self) -> None:
         self._acquirer = self._connect(_producers(self._config.producer))

@@ -73,23 +73,37 @@ int GCInitLib(void) { return initialized++ ? (initialized = 1, IN_USE) : SUCCESS
 int GCCloseLib(void) { initialized = 0; return SUCCESS; }
 int GCGetInfo(int32_t what, int32_t *type, void *out, size_t *room) {
     if (what == 9 || what == 10) return put_number(UINT32, what == 9 ? 1 : 5, type, out, room);
-    return what == 8 ? put_number(INT32, 1, type, out, room) : put_text(what == 4 ? "GEV" : "gige", type, out, room);
+    if (what == 8) return put_number(INT32, 1, type, out, room);
+    return put_text(what == 4 ? "GEV" : "gige", type, out, room);
 }
-int GCGetLastError(int32_t *code, char *text, size_t *room) { *code = FAILED; return put_text("refused", 0, text, room); }
+int GCGetLastError(int32_t *code, char *text, size_t *room) {
+    *code = FAILED;
+    return put_text("refused", 0, text, room);
+}
 
 int TLOpen(void **handle) { *handle = &system_handle; return SUCCESS; }
 int TLClose(void *handle) { return SUCCESS; }
-int TLGetInfo(void *handle, int32_t what, int32_t *type, void *out, size_t *room) { return GCGetInfo(what, type, out, room); }
-int TLUpdateInterfaceList(void *handle, uint8_t *changed, uint64_t timeout) { if (changed) *changed = 0; return SUCCESS; }
+int TLGetInfo(void *handle, int32_t what, int32_t *type, void *out, size_t *room) {
+    return GCGetInfo(what, type, out, room);
+}
+int TLUpdateInterfaceList(void *handle, uint8_t *changed, uint64_t timeout) {
+    if (changed) *changed = 0;
+    return SUCCESS;
+}
 int TLGetNumInterfaces(void *handle, uint32_t *count) { *count = 1; return SUCCESS; }
 int TLGetInterfaceID(void *handle, uint32_t index, char *id, size_t *room) { return put_text("all", 0, id, room); }
 int TLGetInterfaceInfo(void *handle, const char *id, int32_t what, int32_t *type, void *out, size_t *room) {
     return put_text(what == 2 ? "GEV" : "all", type, out, room);
 }
-int TLOpenInterface(void *handle, const char *id, void **interface) { *interface = &interface_handle; return SUCCESS; }
+int TLOpenInterface(void *handle, const char *id, void **interface) {
+    *interface = &interface_handle;
+    return SUCCESS;
+}
 
 int IFClose(void *handle) { return SUCCESS; }
-int IFGetInfo(void *handle, int32_t what, int32_t *type, void *out, size_t *room) { return TLGetInterfaceInfo(0, 0, what, type, out, room); }
+int IFGetInfo(void *handle, int32_t what, int32_t *type, void *out, size_t *room) {
+    return TLGetInterfaceInfo(0, 0, what, type, out, room);
+}
 int IFGetParentTL(void *handle, void **parent) { *parent = &system_handle; return SUCCESS; }
 int IFUpdateDeviceList(void *handle, uint8_t *changed, uint64_t timeout) {
     if (!arv_get_n_devices()) arv_update_device_list(); /* takes a second; a test's camera keeps its address */
@@ -131,10 +145,14 @@ int IFOpenDevice(void *handle, const char *id, int32_t access, void **opened) {
 
 int DevClose(Device *device) { g_object_unref(device->camera); free(device); return SUCCESS; }
 int DevGetPort(Device *device, void **port) { *port = &device->remote; return SUCCESS; }
-int DevGetInfo(Device *device, int32_t what, int32_t *type, void *out, size_t *room) { return IFGetDeviceInfo(0, device->serial, what, type, out, room); }
+int DevGetInfo(Device *device, int32_t what, int32_t *type, void *out, size_t *room) {
+    return IFGetDeviceInfo(0, device->serial, what, type, out, room);
+}
 int DevGetParentIF(Device *device, void **parent) { *parent = &interface_handle; return SUCCESS; }
 int DevGetNumDataStreams(Device *device, uint32_t *count) { *count = 1; return SUCCESS; }
-int DevGetDataStreamID(Device *device, uint32_t index, char *id, size_t *room) { return put_text("stream", 0, id, room); }
+int DevGetDataStreamID(Device *device, uint32_t index, char *id, size_t *room) {
+    return put_text("stream", 0, id, room);
+}
 int DevOpenDataStream(Device *device, const char *id, void **opened) {
     Stream *stream = calloc(1, sizeof *stream);
     stream->device = device;
@@ -149,9 +167,10 @@ static const char NOTHING[] =
     " MajorVersion='1' MinorVersion='0' SubMinorVersion='0' ToolTip='' ProductGuid='0' VersionGuid='0'"
     " xmlns='http://www.genicam.org/GenApi/Version_1_1'><Category Name='Root'/><Port Name='module'/>"
     "</RegisterDescription>";
+static const char *xml_of(Port *port) { return port->kind == REMOTE ? port->xml : NOTHING; }
 int GCReadPort(Port *port, uint64_t address, void *out, size_t *size) {
     GError *error = NULL;
-    if (address >= XML_ADDRESS) memcpy(out, (port->kind == REMOTE ? port->xml : NOTHING) + (address - XML_ADDRESS), *size);
+    if (address >= XML_ADDRESS) memcpy(out, xml_of(port) + (address - XML_ADDRESS), *size);
     else if (port->kind != REMOTE) return NOT_IMPLEMENTED;
     else arv_device_read_memory(port->device, address, *size, out, &error);
     return answer(error);
@@ -167,7 +186,8 @@ int GCGetPortURLInfo(Port *port, uint32_t index, int32_t what, int32_t *type, vo
     char url[96];
     size_t size = port->kind == REMOTE ? port->xml_size : strlen(NOTHING);
     if (what != 0) return NOT_IMPLEMENTED;
-    snprintf(url, sizeof url, "local:%s.xml;%llx;%zx", port->kind == REMOTE ? "camera" : "module", (unsigned long long)XML_ADDRESS, size);
+    snprintf(url, sizeof url, "local:%s.xml;%llx;%zx", port->kind == REMOTE ? "camera" : "module",
+             (unsigned long long)XML_ADDRESS, size);
     return put_text(url, type, out, room);
 }
 int GCGetPortURL(Port *port, char *url, size_t *room) { return GCGetPortURLInfo(port, 0, 0, NULL, url, room); }
@@ -212,10 +232,13 @@ int DSStartAcquisition(Stream *stream, int32_t flags, uint64_t count) {
 int DSStopAcquisition(Stream *stream, int32_t flags) { g_clear_object(&stream->stream); return SUCCESS; }
 int DSClose(Stream *stream) { DSStopAcquisition(stream, 1); DSFlushQueue(stream, 4); free(stream); return SUCCESS; }
 int DSGetParentDev(Stream *stream, void **parent) { *parent = stream->device; return SUCCESS; }
+static uint64_t underruns(Stream *stream) {
+    return stream->stream ? arv_stream_get_info_uint64_by_name(stream->stream, "n_underruns") : 0;
+}
 int DSGetInfo(Stream *stream, int32_t what, int32_t *type, void *out, size_t *room) {
     switch (what) {
     case 0: return put_text("stream", type, out, room);
-    case 2: return put_number(UINT64, stream->stream ? arv_stream_get_info_uint64_by_name(stream->stream, "n_underruns") : 0, type, out, room);
+    case 2: return put_number(UINT64, underruns(stream), type, out, room);
     case 3: return put_number(SIZE, g_list_length(stream->announced), type, out, room);
     case 8: return put_number(BOOL8, stream->stream != NULL, type, out, room);
     case 9: return put_number(BOOL8, 0, type, out, room);
@@ -257,7 +280,10 @@ int DSGetBufferInfo(Stream *stream, Frame *frame, int32_t what, int32_t *type, v
     }
 }
 
-int GCRegisterEvent(void *source, int32_t kind, void **event) { *event = source; return kind == 1 ? SUCCESS : NOT_IMPLEMENTED; }
+int GCRegisterEvent(void *source, int32_t kind, void **event) {
+    *event = source;
+    return kind == 1 ? SUCCESS : NOT_IMPLEMENTED;
+}
 int GCUnregisterEvent(void *source, int32_t kind) { return SUCCESS; }
 int EventGetData(Stream *stream, void *out, size_t *room, uint64_t timeout_ms) {
     void *popped = !stream->stream ? NULL : timeout_ms == 0 ? arv_stream_try_pop_buffer(stream->stream)
@@ -268,11 +294,13 @@ int EventGetData(Stream *stream, void *out, size_t *room, uint64_t timeout_ms) {
     void *data[2] = {frame, frame->user};
     return put(POINTER, data, sizeof data, NULL, out, room);
 }
-int EventGetDataInfo(Stream *stream, const void *in, size_t size, int32_t what, int32_t *type, void *out, size_t *room) {
+int EventGetDataInfo(Stream *stream, const void *in, size_t size, int32_t what, int32_t *type, void *out,
+                     size_t *room) {
     return put(POINTER, (const char *)in + (what == 1 ? sizeof(void *) : 0), sizeof(void *), type, out, room);
 }
 int EventGetInfo(Stream *stream, int32_t what, int32_t *type, void *out, size_t *room) {
-    return what == 0 ? put_number(INT32, 1, type, out, room) : put_number(SIZE, what == 1 ? 0 : 2 * sizeof(void *), type, out, room);
+    if (what == 0) return put_number(INT32, 1, type, out, room);
+    return put_number(SIZE, what == 1 ? 0 : 2 * sizeof(void *), type, out, room);
 }
 int EventFlush(Stream *stream) { return SUCCESS; }
 int EventKill(Stream *stream) { return SUCCESS; }

@@ -2,7 +2,8 @@
 
 from dataset.compression import Chunk, compress
 from dataset.session.edit import check_name, write_calibration, write_object, write_poses, write_split
-from dataset.session.reader import Frame, Session
+from dataset.session.frame import Frame
+from dataset.session.reader import Session
 from dataset.session.records import Clocks, ObjectPoses, ObjectRecord, PackedMasks, mask_box
 from dataset.session.writer import SessionWriter
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -22,6 +21,7 @@ from dataset.polarizer_response import PolarizerResponse
 from dataset.schema import CAMERA_ATTRIBUTES, FRAME_COLUMNS, ROBOT_COLUMNS, TABLES, declaration
 from dataset.session.contents import Contents, StoredMasks
 from dataset.session.files import open_for_reading
+from dataset.session.frame import Frame
 from dataset.session.records import Clocks, ObjectPoses, ObjectRecord
 from dataset.transforms import SE3
 
@@ -398,39 +398,3 @@ class Session:
             return None
         fits = tuple(ClockFit(float(a), float(b), float(sigma)) for _, a, b, sigma in pieces)
         return DeviceClock(tuple(int(row) for row in pieces[:, 0]), fits)
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One frame of a session; everything is read when asked.
-
-    Attributes:
-        session: where it comes from; must stay open.
-        index: within the session.
-    """
-
-    session: Session
-    index: int
-
-    @property
-    def raw(self) -> Raw:
-        """(H, W) uint8 or uint16 mosaic."""
-        return self.session.raw(self.index)
-
-    @property
-    def stokes(self) -> Stokes:
-        """Undistorted Stokes image, one pixel per super-pixel."""
-        return self.session.stokes(self.index)
-
-    @property
-    def T_base_cam(self) -> SE3 | None:
-        """Camera pose at mid-exposure; None before annotation."""
-        return None if self.session.poses is None else self.session.poses[self.index]
-
-    def T_cam_obj(self, name: str) -> SE3:
-        """An object's pose; NaN where unknown."""
-        return self.session.object_poses(name).T_cam_obj[self.index]
-
-    def mask(self, name: str) -> NDArray[np.bool_]:
-        """(h, w) bool visible mask of an object."""
-        return self.session.object_poses(name).mask(self.index)

@@ -23,6 +23,8 @@ from s2p3.objects import ObjectModel
 Kind = Literal["teacher", "student", "detector"]
 Network = TypeVar("Network", bound=nn.Module)
 FORMAT = "s2p3-checkpoint-1"
+RESUME = ".resume.safetensors"
+"""What the file ends on from which the training of a checkpoint goes on."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def toolkit_commit() -> str:
 
 def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
     """Writes `path` (NAME.safetensors) and NAME.json, the weights last and atomically; the weights' own
-    metadata says the same as NAME.json.
+    metadata says the same as NAME.json. The resume file is done with.
 
     Of several processes that train together the first one writes, and the others wait for it.
     """
@@ -125,6 +127,7 @@ def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
         path.with_suffix(".json").write_text(text, encoding="utf-8")
         save_tensors(path, weights, {"s2p3": text})
         shutil.copymode(path.with_suffix(".json"), path)  # safetensors writes for the owner only
+        path.with_suffix(RESUME).unlink(missing_ok=True)
     if together:
         dist.barrier()
 

@@ -91,7 +91,7 @@ def divide(
 ) -> Division:
     """Which frames are for learning and which for scoring.
 
-    Raises ToolkitError: as `Examples.of`.
+    Raises ToolkitError: as `Examples.of`; or no frame is left to learn from.
     """
     shown = shown_rows(sessions, model)
     rows = torch.arange(len(shown)) if frames.split is None else _of_split(sessions, shown, frames.split)
@@ -107,7 +107,10 @@ def divide(
     if Path(validation).is_file():
         return Division(rows, nothing, Path(validation), f"the session {validation}")
     held_out = _of_split(sessions, shown, validation)
-    return Division(rows[~torch.isin(rows, held_out)], held_out, None, f"the split {validation!r}")
+    rows = rows[~torch.isin(rows, held_out)]
+    if not len(rows):
+        raise ToolkitError(f"the split {validation!r} leaves no frame to learn from; name another")
+    return Division(rows, held_out, None, f"the split {validation!r}")
 
 
 def _of_split(sessions: Sequence[Path], shown: Sequence[tuple[int, int]], split: str) -> Tensor:

@@ -10,6 +10,7 @@ rasterization.
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
@@ -28,6 +29,10 @@ from dataset.stokes_cache import cached_stokes
 from s2p3.config import InputConfig
 from s2p3.objects import ObjectModel
 from s2p3.training.crops import LabelledCrops, collate, depth_of, labelled_crop, shown_rows
+from s2p3.training.trees import named_tensors
+
+_SHARED_MEMORY = Path("/dev/shm")  # where torch puts the tensors of several processes on Linux
+_ROOM_FOR_BATCHES = 1 << 28
 
 Row = dict[str, NDArray[np.generic]]
 
@@ -165,8 +170,10 @@ def stream(steps: Steps, first: int, last: int, workers: int = 0) -> Generator[A
     Args:
         workers: processes; 0 makes the batches here, when they are asked for.
 
-    Raises ToolkitError: whatever kept a worker from making a batch.
+    Raises ToolkitError: whatever kept a worker from making a batch; too little shared memory for them.
     """
+    if workers:
+        _insist_on_room(steps)
     loader = DataLoader(
         _Telling(steps),
         batch_size=None,
@@ -181,6 +188,20 @@ def stream(steps: Steps, first: int, last: int, workers: int = 0) -> Generator[A
         if isinstance(made, _Failed):
             raise ToolkitError(made.why)
         yield made
+
+
+def _insist_on_room(steps: Steps) -> None:
+    """Raises ToolkitError: a process that fills shared memory up is killed without a word."""
+    needed = sum(part.nbytes for part in named_tensors(steps.data, "").values() if not part.is_shared())
+    if not _SHARED_MEMORY.is_dir():
+        return
+    free = shutil.disk_usage(_SHARED_MEMORY).free
+    if free < needed + _ROOM_FOR_BATCHES:
+        raise ToolkitError(
+            f"workers share crops and batches through {_SHARED_MEMORY}, which has {free / 1e9:.2f} GB free "
+            f"and needs {(needed + _ROOM_FOR_BATCHES) / 1e9:.2f}: enlarge it (docker: --shm-size), or give "
+            "--workers 0, or --storage disk"
+        )
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
 from s2p3.config import Schedule, StageConfig
-from s2p3.training.checkpoint import save_tensors
+from s2p3.training.checkpoint import RESUME, save_tensors
 from s2p3.training.loader import Data, Steps, stream
 from s2p3.training.log import RunLog
 from s2p3.training.processes import Processes
@@ -103,8 +103,8 @@ def optimize(
 
     Args:
         data: what the batches are drawn from.
-        path: of the checkpoint to be. The log NAME.log.jsonl, the resume file NAME.resume.safetensors and the
-            folder tensorboard/NAME stand beside it.
+        path: of the checkpoint to be. The log NAME.log.jsonl, the folder tensorboard/NAME and, until
+            `checkpoint.save` has written it, the resume file NAME.resume.safetensors stand beside it.
         fingerprint: of everything the run depends on besides `settings`; a resume file of another run is
             refused.
         label: what the progress bar and messages call this run.
@@ -124,7 +124,7 @@ def optimize(
     optimizer = torch.optim.AdamW(
         network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
     )
-    state = State(path.with_suffix(".resume.safetensors"), run, network, average, optimizer)
+    state = State(path.with_suffix(RESUME), run, network, average, optimizer)
     first = processes.agreed(state.restore())
     forward = processes.prepare(network)
     batches = stream(Steps(data, settings.batch, settings.seed, processes.share), first, steps, workers)
@@ -156,9 +156,8 @@ def optimize(
             if scored or done % _LOG_EVERY == 0 or done == steps:
                 seconds = round(time.perf_counter() - started, 2)
                 log.write({"step": done, "seconds": seconds, "learning_rate": rate, **values})
-            if done % settings.checkpoint_every == 0 and done < steps:
+            if done % settings.checkpoint_every == 0 or done == steps:
                 state.store(done)
-    state.forget()
     best = state.best
     if best is not None:
         average.load_state_dict(best.weights)

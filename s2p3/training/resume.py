@@ -85,10 +85,6 @@ class State:
             self.best = Best(parts["best"], int(metadata["best_step"]), float(metadata["best_score"]))
         return int(metadata["step"])
 
-    def forget(self) -> None:
-        """The training is done."""
-        self.path.unlink(missing_ok=True)
-
     def _restore_moments(self, moments: dict[str, Tensor]) -> None:
         states: dict[int, dict[str, Tensor]] = {}
         weights = [weight for group in self.optimizer.param_groups for weight in group["params"]]

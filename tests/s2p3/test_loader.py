@@ -15,6 +15,7 @@ from torch import Tensor
 from dataset.errors import ToolkitError
 from s2p3.config import fast
 from s2p3.objects import build
+from s2p3.training import loader
 from s2p3.training.crops import LabelledCrops, collate, labelled_crops
 from s2p3.training.loader import CropDataset, Share, Steps, stream
 from s2p3.training.pretrain import LabelledData
@@ -108,6 +109,12 @@ class Rows:
     def __call__(self, rows: Tensor, generator: torch.Generator) -> list[int]:
         del generator
         return rows.tolist()
+
+
+def test_too_little_shared_memory_is_said_before_it_kills(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loader, "_ROOM_FOR_BATCHES", 1 << 60)
+    with pytest.raises(ToolkitError, match=r"/dev/shm.*--shm-size.*--workers 0"):
+        next(stream(Steps(Rows(4), 2, 0), 0, 2, workers=1))
 
 
 def test_what_keeps_a_worker_from_its_batch_is_said_in_one_line(session: Path) -> None:

@@ -195,6 +195,8 @@ def test_frames_to_validate_on_are_named_by_split_or_session(
     assert chosen(None, "val") == ([0, 1, 3, 4, 6, 7], [2, 5])
     assert chosen("train", "val") == ([0, 3, 6], [2, 5])
     assert chosen("train", str(cup_session)) == ([0, 2, 3, 6], [])
+    with pytest.raises(ToolkitError, match="'train' leaves no frame to learn from"):
+        chosen("train", "train")
     with pytest.raises(ToolkitError, match=r"no split 'night' \(its splits: train, val\)"):
         chosen(None, "night")
 
@@ -236,27 +238,6 @@ def test_weights_of_another_network_are_refused(trained: Path, tmp_path: Path) -
         load_teacher(tmp_path / "teacher.safetensors")
 
 
-def test_a_stopped_training_resumes_exactly(
-    trained: Path, cup_session: Path, cup: ObjectModel, tmp_path: Path
-) -> None:
-    def stop(step: int, steps: int, values: dict[str, float]) -> None:
-        del steps, values
-        if step == 17:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_student([cup_session], cup, tiny(), tmp_path, on_step=stop)
-    assert (tmp_path / "student.resume.safetensors").exists()
-    resumed_from = []
-    train_student([cup_session], cup, tiny(), tmp_path, on_step=lambda step, *_: resumed_from.append(step))
-    assert resumed_from[0] == 11
-    whole, resumed = log_of(trained / "student.log.jsonl"), log_of(tmp_path / "student.log.jsonl")
-    assert [line["total"] for line in whole] == [line["total"] for line in resumed]
-    a, b = (load_file(folder / "student.safetensors") for folder in (trained, tmp_path))
-    assert all(torch.equal(a[name], b[name]) for name in a)
-    assert not (tmp_path / "student.resume.safetensors").exists()
-
-
 def test_a_killed_training_goes_on_as_if_nothing_had_happened(
     trained: Path, cup_session: Path, tmp_path: Path
 ) -> None:
@@ -275,6 +256,9 @@ def test_a_killed_training_goes_on_as_if_nothing_had_happened(
     assert resume.exists()
     assert not (tmp_path / "student.safetensors").exists()
     subprocess.run(command, check=True, capture_output=True, timeout=240)
+    charts = list((tmp_path / "tensorboard" / "student").iterdir())
+    assert len(charts) == 2  # a training that begins anew clears the folder
+    assert not resume.exists()
     whole, resumed = log_of(trained / "student.log.jsonl"), log_of(tmp_path / "student.log.jsonl")
     for line in (*whole, *resumed):
         del line["seconds"]

@@ -42,9 +42,14 @@ CONVENTIONS = (
 )
 
 
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What is known of a rig so far; parts not estimated yet are None."""
+    """What is known of a rig so far; parts not estimated yet are None. What was read from a file gives the
+    file's text again, so that its digest holds wherever it is copied to."""
 
     board: BoardSpec | None = None
     intrinsics: IntrinsicsRecord | None = None
@@ -54,6 +59,7 @@ class Calibration:
     polarizer: PolarizerRecord | None = None
     fixed_camera: FixedCameraRecord | None = None
     objects: Mapping[str, ObjectPoseRecord] = field(default_factory=dict)
+    created_utc: str = field(default_factory=_now, metadata={"stored": False})
 
     def merged(self, newer: Calibration) -> Calibration:
         """This calibration with every part that ``newer`` has taken from it; objects are merged by name."""
@@ -89,7 +95,7 @@ class Calibration:
             "format": FORMAT,
             "version": VERSION,
             "toolkit": metadata.version("s2p3"),
-            "created_utc": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "created_utc": self.created_utc,
             "conventions": CONVENTIONS,
             **_encode(self),
         }

@@ -65,7 +65,7 @@ def add_intrinsics(
     warnings = remarks.of_intrinsics(result, frames)
     record = IntrinsicsRecord.of(result, (Source.of(session),), warnings)
     kept = replace(known, hand_eye=None, fixed_camera=None, time_offset=None)
-    replace(kept, board=spec, intrinsics=record).save(calibration)
+    kept.merged(Calibration(board=spec, intrinsics=record)).save(calibration)
     page = intrinsics_report(spec, result, frames, pictures, warnings, str(session))
     report_path(calibration, "intrinsics").write_text(page, encoding="utf-8")
     return record

@@ -8,6 +8,7 @@ scaled so that the sensor's white level is 1; S0 of unpolarized white light is t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -120,6 +121,12 @@ def as_angles(intensities: NDArray[np.floating]) -> Image:
     return images
 
 
+def as_words(raw: NDArray[Any]) -> NDArray[Any]:
+    """A colour mosaic (H, W) as `colour_stokes` reads it: (H, W/4), the four pixels of a super-pixel's row in
+    one word."""
+    return np.require(np.ascontiguousarray(raw).view(f"u{4 * raw.itemsize}"), requirements="A")
+
+
 def split_angles(raw: Raw) -> Raw:
     """The mosaic (H, W) as (4, H/2, W/2) angle images in its own dtype; each of a colour sensor's holds a
     Bayer mosaic with red at the top left.
@@ -184,8 +191,7 @@ def decode(raw: Raw, layout: Mosaic, bits: int, response: PolarizerResponse | No
     elif layout == "mono":
         mono_stokes(pixels, scale, SATURATED * white, np.float32(DARK), out, valid)
     else:
-        words = np.require(pixels.view(f"u{4 * pixels.itemsize}"), requirements="A")
-        colour_stokes(words, scale, SATURATED * white, np.float32(DARK), out, valid)
+        colour_stokes(as_words(pixels), scale, SATURATED * white, np.float32(DARK), out, valid)
     return Stokes(out[0], out[1], out[2], valid)
 
 

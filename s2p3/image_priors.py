@@ -7,22 +7,16 @@ left to save.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dataset import ToolkitError
 from dataset.frames import Mosaic
-from dataset.mosaic_kernels import angle_stokes
-from dataset.polarimetry import Raw, as_angles, check_mosaic, decode, superpixel
+from dataset.polarimetry import DARK as FAINT
+from dataset.polarimetry import SATURATED, Raw, as_angles, as_words, check_mosaic, superpixel, white_level
+from s2p3 import physics_kernels as kernels
 from s2p3.physics import DARK, check_index
-from s2p3.physics_kernels import priors
-
-Image = NDArray[np.float32]
-Planes = tuple[Image, Image, Image]
-
-_BAND = 32  # rows
+from s2p3.physics_kernels import Image, Row
 
 
 def mosaic_priors(
@@ -46,14 +40,14 @@ def mosaic_priors(
     size = superpixel(layout)
     check_mosaic(raw, size)
     shape = raw.shape[0] // size, raw.shape[1] // size
-    valid = np.empty(shape, np.bool_)
-
-    def measured(top: int, end: int) -> Planes:
-        stokes = decode(raw[size * top : size * end], layout, bits)
-        valid[top:end] = stokes.valid
-        return stokes.s0, stokes.s1, stokes.s2
-
-    return _in_bands(measured, shape, index, K, out), valid
+    white = white_level(bits)
+    limits = np.float32(1 / white), SATURATED * white, np.float32(FAINT)
+    out, valid = _checked(out, shape), np.empty(shape, np.bool_)
+    if layout == "colour":
+        kernels.colour_priors(as_words(raw), *limits, *_constants(index, K), out, valid)
+    else:
+        kernels.mono_priors(np.ascontiguousarray(raw), *limits, *_constants(index, K), out, valid)
+    return out, valid
 
 
 def angle_priors(
@@ -64,35 +58,26 @@ def angle_priors(
     Arguments and errors as of `mosaic_priors`.
     """
     images = as_angles(intensities)
-    height, width = images.shape[1:]
-
-    def measured(top: int, end: int) -> Planes:
-        band = np.empty((3, end - top, width), np.float32)
-        angle_stokes(images, top, band)
-        return band[0], band[1], band[2]
-
-    return _in_bands(measured, (height, width), index, K, out)
+    out = _checked(out, images.shape[1:])
+    kernels.angle_priors(images, *_constants(index, K), out)
+    return out
 
 
-def _in_bands(
-    measured: Callable[[int, int], Planes],
-    shape: tuple[int, int],
-    index: float,
-    K: ArrayLike,
-    out: Image | None,
-) -> Image:
-    """Priors of an image whose rows from `top` up to `end` have the Stokes vectors `measured(top, end)`."""
+def _constants(index: float, K: ArrayLike) -> tuple[Row, np.float32, np.float32]:
+    """fx, fy, cx, cy, the index, and what is no light."""
     check_index(index)
     matrix = np.asarray(K, np.float32)
     pinhole = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], np.float32)
+    return pinhole, np.float32(index), np.float32(DARK)
+
+
+def _checked(out: Image | None, shape: tuple[int, ...]) -> Image:
+    """An array for the priors of an image of this shape."""
     if out is None:
-        out = np.empty((9, *shape), np.float32)
-    elif out.shape != (9, *shape) or out.dtype != np.float32 or not out.flags.c_contiguous:
+        return np.empty((9, *shape), np.float32)
+    if out.shape != (9, *shape) or out.dtype != np.float32 or not out.flags.c_contiguous:
         raise ToolkitError(
             f"priors of a {shape[0]}x{shape[1]} image need a contiguous float32 array (9, h, w) to go into, "
             f"not {out.dtype} {out.shape}"
         )
-    for top in range(0, shape[0], _BAND):
-        s0, s1, s2 = measured(top, min(top + _BAND, shape[0]))
-        priors(s0, s1, s2, pinhole, np.float32(index), np.float32(DARK), top, out)
     return out

@@ -16,9 +16,13 @@ branches: each is vectorized, and short enough for the processor to work on seve
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from dataset.mosaic_kernels import angle_stokes, colour_stokes, mono_stokes
 
 Row = NDArray[np.float32]
 Image = NDArray[np.float32]
@@ -28,6 +32,10 @@ _VECTOR_MATH = {"arcp", "contract", "nsz", "afn"}
 
 _ONE, _TWO, _FOUR = np.float32(1), np.float32(2), np.float32(4)
 _TINY = np.float32(1e-30)
+
+
+_BAND = 8
+"""Rows whose Stokes vectors stay in the processor's cache from one loop to the next."""
 
 
 @numba.njit(inline="always")
@@ -111,3 +119,55 @@ def priors(
             sin, z = sqrt2n * scale, -_TWO * index * m * scale * _rsqrt(b + q)
             normal = _camera_frame(-sine[x] * sin, -cosine[x] * sin, z, us[x] * c, v * c, c, bend[x])
             ox[x], oy[x], oz[x] = normal
+
+
+@numba.njit(cache=True, nogil=True)
+def angle_priors(images: Image, pinhole: Row, index: np.float32, dark: np.float32, out: Image) -> None:
+    """(4, H, W) angle images -> (9, H, W) normals."""
+    _, height, width = images.shape
+    for top in range(0, height, _BAND):
+        stokes = np.empty((3, min(_BAND, height - top), width), np.float32)
+        angle_stokes(images, top, stokes)
+        priors(stokes[0], stokes[1], stokes[2], pinhole, index, dark, top, out)
+
+
+@numba.njit(cache=True, nogil=True)
+def colour_priors(
+    words: NDArray[Any],
+    scale: np.float32,
+    saturated: float,
+    dim: np.float32,
+    pinhole: Row,
+    index: np.float32,
+    dark: np.float32,
+    out: Image,
+    valid: NDArray[np.bool_],
+) -> None:
+    """A mosaic as `colour_stokes` takes it -> (9, H, W) normals, and (H, W) validity."""
+    height, width = valid.shape
+    for top in range(0, height, _BAND):
+        end = min(top + _BAND, height)
+        stokes = np.empty((3, end - top, width), np.float32)
+        colour_stokes(words[4 * top : 4 * end], scale, saturated, dim, stokes, valid[top:end])
+        priors(stokes[0], stokes[1], stokes[2], pinhole, index, dark, top, out)
+
+
+@numba.njit(cache=True, nogil=True)
+def mono_priors(
+    pixels: NDArray[Any],
+    scale: np.float32,
+    saturated: float,
+    dim: np.float32,
+    pinhole: Row,
+    index: np.float32,
+    dark: np.float32,
+    out: Image,
+    valid: NDArray[np.bool_],
+) -> None:
+    """A mosaic as `mono_stokes` takes it -> (9, H, W) normals, and (H, W) validity."""
+    height, width = valid.shape
+    for top in range(0, height, _BAND):
+        end = min(top + _BAND, height)
+        stokes = np.empty((3, end - top, width), np.float32)
+        mono_stokes(pixels[2 * top : 2 * end], scale, saturated, dim, stokes, valid[top:end])
+        priors(stokes[0], stokes[1], stokes[2], pinhole, index, dark, top, out)

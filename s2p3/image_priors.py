@@ -1,8 +1,7 @@
 """Shape priors of whole pictures at a camera's rate: from a raw mosaic, or from four angle images.
 
 `physics.shape_priors` of the same Stokes image gives the same. Here the image is worked through in bands
-whose Stokes vectors never leave the processor's cache, which halves what goes through memory: all there is
-left to save.
+whose Stokes vectors never leave the processor's cache: a third less goes through memory.
 """
 
 from __future__ import annotations

@@ -119,6 +119,7 @@ def add_hand_eye(
         require_resolution(opened, prior)
         found = detect_session(opened, spec, on_progress)
         views, _ = views_at_rest(opened, found)  # the result counts these, not all that show the board
+        views = [views[i] for i in select_views([d for _, d in views], spec)]
         result = hand_eye_from_session(opened, spec, prior, views, mount, refine_camera)
         pictures = _pictures(opened, views)
     frames = [index for index, _ in views]

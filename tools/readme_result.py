@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from s2p3.demo_report import TARGETS
+from s2p3.provenance import checked_out_commit
 
 ROOT = Path(__file__).parents[1]
 BEGIN, END = "<!-- demo:begin -->", "<!-- demo:end -->"
@@ -29,7 +29,7 @@ def main() -> int:
         result = json.loads((options.folder / "result.json").read_text(encoding="utf-8"))
         settings = json.loads((options.folder / "steps.json").read_text(encoding="utf-8"))["settings"]
         text = options.readme.read_text(encoding="utf-8")
-        block = result_block(result, settings, checked_out_commit())
+        block = result_block(result, settings, checked_out_commit("README.md"))
         options.readme.write_text(with_block(text, block), encoding="utf-8")
     except (OSError, ValueError, KeyError) as error:
         print(f"readme_result: {options.folder} holds no finished demo ({error}); run s2p3 demo first")
@@ -70,12 +70,6 @@ def command(settings: Mapping[str, Any]) -> str:
     return f"s2p3 demo{quick} --object {settings['object']} --seed {settings['seed']}"
 
 
-def checked_out_commit() -> str:
-    """Short name of the commit, marked where tracked files other than README.md differ from it."""
-    changed = _git("diff", "--name-only", "HEAD", "--", ".", ":(exclude)README.md")
-    return _git("rev-parse", "--short=10", "HEAD") + (" + uncommitted changes" if changed else "")
-
-
 def with_block(text: str, block: str) -> str:
     """`text` with the part between the two comments replaced.
 
@@ -86,11 +80,6 @@ def with_block(text: str, block: str) -> str:
     if not (begin and end):
         raise ValueError(f"no {BEGIN} followed by {END} in the file to rewrite")
     return f"{head}{BEGIN}\n{block}\n{END}{tail}"
-
-
-def _git(*arguments: str) -> str:
-    run = subprocess.run(["git", *arguments], cwd=ROOT, check=True, capture_output=True, text=True)
-    return run.stdout.strip()
 
 
 if __name__ == "__main__":

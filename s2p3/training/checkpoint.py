@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -19,6 +17,7 @@ from acquisition import typed_toml
 from dataset.errors import ToolkitError
 from s2p3.config import ExperimentConfig
 from s2p3.objects import ObjectModel
+from s2p3.provenance import toolkit_state
 
 Kind = Literal["teacher", "student", "detector"]
 Network = TypeVar("Network", bound=nn.Module)
@@ -96,21 +95,9 @@ class CheckpointInfo:
             step,
             config,
             data,
-            toolkit_commit(),
+            toolkit_state(),
             validation,
         )
-
-
-def toolkit_commit() -> str:
-    """Version and, of a checkout, the commit that is running; "-dirty" where its files differ from it."""
-    words = ["git", "describe", "--always", "--abbrev=10", "--exclude=*", "--dirty"]
-    try:
-        found = subprocess.run(
-            words, cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=10
-        )
-    except (OSError, subprocess.SubprocessError):
-        return version("s2p3")
-    return f"{version('s2p3')} {found.stdout.strip()}"
 
 
 def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:

@@ -29,6 +29,7 @@ from s2p3.networks.detector import Detection
 from s2p3.networks.pose_head import ray_rotation, site_from_translation
 from s2p3.networks.teacher import Teacher
 from s2p3.objects import ObjectModel, Symmetry, build
+from s2p3.provenance import toolkit_state
 from s2p3.rendering.differentiable import RenderMesh
 from s2p3.training import (
     Crops,
@@ -176,7 +177,7 @@ def test_weights_are_chosen_on_frames_that_were_kept_from_the_training(
         described = json.loads(file.metadata()["s2p3"])
     assert described == json.loads((trained / "student.json").read_text())
     assert list(described["data"].values()) == list(content_hashes([cup_session], cup).values())
-    assert described["commit"] == checkpoint.toolkit_commit()
+    assert described["commit"] == toolkit_state()
 
 
 def test_frames_to_validate_on_are_named_by_split_or_session(

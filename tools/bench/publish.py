@@ -18,6 +18,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from s2p3.provenance import checked_out_commit
+
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "benchmarks"
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -78,19 +80,13 @@ def publish(name: str) -> bool:
     print(done.stdout, flush=True)
     result = {
         "command": command,
-        "commit": commit(),
+        "commit": checked_out_commit("docs/benchmarks", "docs/benchmarks.md"),
         "date": date.today().isoformat(),
         "figures": json.loads(done.stdout.strip().splitlines()[-1]),
     }
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return True
-
-
-def commit() -> str:
-    """The commit that is checked out; "-dirty" when tracked files differ from it."""
-    words = ["git", "describe", "--always", "--abbrev=10", "--exclude=*", "--dirty"]
-    return subprocess.check_output(words, cwd=ROOT, text=True).strip()
 
 
 def page() -> str:

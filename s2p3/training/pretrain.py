@@ -133,7 +133,8 @@ class Pretraining:
         if examples.held_out is not None:
             scorer = PoseScorer(examples.held_out, self.model, self.config)
             score = Score(scorer.name, scorer, self.settings.validations)
-        fingerprint = f"{self.hashes} {self.config} {self.model.name} {examples.origin}"
+        rows = examples.rows.tolist()
+        fingerprint = f"{self.hashes} {self.config} {self.model.name} {rows} {examples.origin}"
         trained = optimize(
             network,
             data,

@@ -180,9 +180,13 @@ class ChildProcess:
         )
 
 
-def die_with_parent() -> None:
-    """Called first by a child: ends this process when the one that started it dies, however it dies."""
-    parent = os.getppid()
+def die_with_parent(parent: int | None = None) -> None:
+    """Called first by a child: ends this process when the one that started it dies, however it dies.
+
+    Args:
+        parent: id of that process; without it, one that died before this call goes unnoticed.
+    """
+    parent = os.getppid() if parent is None else parent
 
     # The kernel sends the signal when the starting *thread* ends, which need not be the end of its process.
     def on_parent_thread_end(number: int, frame: FrameType | None) -> None:
@@ -193,6 +197,8 @@ def die_with_parent() -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGHUP), 0, 0, 0) != 0:
         raise ToolkitError(f"prctl(PR_SET_PDEATHSIG) failed: {os.strerror(ctypes.get_errno())}")
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def serve_commands(handle: Callable[[str], str]) -> None:

@@ -1,8 +1,12 @@
-"""Runs trainings side by side, a process and a thread each: two threads sharing one training are slower."""
+"""Runs trainings side by side, a process and a thread each: two threads sharing one training are slower.
+
+They end with the process that started them, however it ends.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -16,6 +20,13 @@ from s2p3.commands.output import counting_many
 
 _POLL_S = 1.0
 _TAIL_BYTES = 4096
+_COMMAND_LINE = """
+import sys
+from acquisition.process import die_with_parent
+die_with_parent({parent})
+from s2p3.cli import main
+sys.exit(main())
+"""
 
 
 @dataclass(frozen=True)
@@ -61,7 +72,7 @@ def run_side_by_side(trainings: Mapping[str, Training]) -> None:
 
 def _start(training: Training, stack: ExitStack) -> subprocess.Popen[bytes]:
     training.log.parent.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "s2p3.cli", *training.words]
+    command = [sys.executable, "-c", _COMMAND_LINE.format(parent=os.getpid()), *training.words]
     with _output(training).open("wb") as stream:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT)
     stack.callback(_end, process)

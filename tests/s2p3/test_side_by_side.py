@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -30,6 +35,41 @@ def test_one_that_fails_is_quoted_and_ends_the_others(cup_session: Path, tmp_pat
     with pytest.raises(ToolkitError, match=r"^failing: training failed: s2p3: .*no\.h5 does not exist"):
         run_side_by_side({"endless": endless, "failing": failing})
     assert children() == before
+
+
+def test_trainings_end_with_a_process_that_is_killed(cup_session: Path, tmp_path: Path) -> None:
+    words = ("train", "student", str(cup_session), "--object", "cup", "--preset", "paper")  # would take hours
+    log = tmp_path / "log.jsonl"
+    training = f"Training({(*words, '--out', str(tmp_path))!r}, pathlib.Path({str(log)!r}), 9)"
+    program = (
+        "import pathlib; from s2p3.side_by_side import Training, run_side_by_side; "
+        f"run_side_by_side({{'endless': {training}}})"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", program])
+    try:
+        wait_until(lambda: bool(running(str(tmp_path))))
+    finally:
+        parent.kill()
+        parent.wait()
+    wait_until(lambda: not running(str(tmp_path)))
+
+
+def running(word: str) -> list[int]:
+    """Ids of the trainings whose command line holds `word`."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            arguments = path.read_text().split("\0")
+            if "train" in arguments and word in arguments:
+                found.append(int(path.parent.name))
+    return found
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 def children() -> set[str]:

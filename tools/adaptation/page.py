@@ -1,0 +1,105 @@
+"""Makes docs/adaptation.md of the studies that are kept: `python tools/adaptation/page.py`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "docs" / "adaptation"
+PAGE = ROOT / "docs" / "adaptation.md"
+
+HEAD = """# Does self-supervision help?
+
+Every table on this page was made by the command above it, at the commit beside it. Teacher and student are
+trained on path-traced and analytic images of the [domain](synthesis.md#domains) `synthetic`; the frames
+they must cope with are of the domain `captured`: another refractive index, harder lamps, a polarized
+background, leaking polarizers, blur, noise, and something in front of the object. They stand in for a
+recorded sequence, and have one advantage over it: exact truth. Losses and images share one Fresnel model,
+so real surfaces will be harder. Settings were tuned on the captured split `val`; the split `test` is looked
+at here only. Boxes and masks are the detector's, and a target without a detection counts as failed.
+"""
+CONTROLS = (
+    "student before",
+    "student, AdaBN alone",
+    "teacher",
+    "teacher, AdaBN alone",
+    "student, pose-only distillation",
+)
+"""What the adapted students are compared with."""
+
+
+def table(result: dict[str, Any]) -> str:
+    """One study as Markdown."""
+    first = next(iter(result["rows"].values()))
+    seeds = ", ".join(str(figures["seed"]) for figures in first)
+    return "\n".join(
+        [
+            f"{first[0]['targets']} targets of the split `{result['split']}`, seeds {seeds}; "
+            f"recall by {first[0]['metric']}, percent.",
+            "",
+            "| | at 0.1 d, by seed | mean | at 0.05 d | rotation, deg | depth, mm | missed |",
+            "|---" * 7 + "|",
+            *(_row(row, figures) for row, figures in result["rows"].items()),
+            "",
+            "Differences of recall at 0.1 d, points, paired, with 95 % intervals, by seed:",
+            "",
+            "| | " + " | ".join(f"above {other}" for other in CONTROLS) + " |",
+            "|---" * (len(CONTROLS) + 1) + "|",
+            *(_differences(row, found) for row, found in result["differences"].items()),
+            "",
+            "In the domain trained on, on held-out frames, recall at 0.1 d by seed:",
+            "",
+            "| | teacher | student |",
+            "|---|---|---|",
+            *(_in_domain(name, rows) for name, rows in result["in_domain"].items()),
+            "",
+        ]
+    )
+
+
+def write_page() -> None:
+    """The page, from the results that are kept."""
+    parts = [HEAD]
+    for path in sorted(RESULTS.glob("*.json")):
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        parts += [
+            f"## {path.stem.capitalize()}\n",
+            f"`{kept['command']}` at commit `{kept['commit']}`, {kept['date']}\n",
+            table(kept["result"]),
+        ]
+    PAGE.write_text("\n".join(parts), encoding="utf-8")
+
+
+def _row(name: str, figures: list[dict[str, Any]]) -> str:
+    def mean(figure: str) -> float:
+        return float(np.mean([each[figure] for each in figures]))
+
+    return (
+        f"| {name} | {_by_seed(figures)} | {mean('recall_10'):.1f} | {mean('recall_5'):.1f} | "
+        f"{mean('rotation_deg'):.1f} | {mean('depth_mm'):+.1f} | {mean('missed'):.0f} |"
+    )
+
+
+def _differences(name: str, found: dict[str, list[dict[str, float]]]) -> str:
+    cells = [
+        "<br>".join(f"{d['value']:+.1f} ({d['low']:+.1f} to {d['high']:+.1f})" for d in found.get(other, []))
+        for other in CONTROLS
+    ]
+    return f"| {name} | {' | '.join(cells)} |"
+
+
+def _in_domain(name: str, rows: dict[str, list[dict[str, Any]]]) -> str:
+    teacher, student = rows["teacher"], rows["student before"]
+    return f"| {name}, {teacher[0]['targets']} targets | {_by_seed(teacher)} | {_by_seed(student)} |"
+
+
+def _by_seed(figures: list[dict[str, Any]]) -> str:
+    return " / ".join(f"{each['recall_10']:.1f}" for each in figures)
+
+
+if __name__ == "__main__":
+    write_page()

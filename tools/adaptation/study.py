@@ -1,0 +1,305 @@
+"""Does self-supervision help? Synthetic sets of one object, frames of another domain, every control.
+
+    python tools/adaptation/study.py --object cup --out out/study    goes on where it was stopped
+    python tools/adaptation/study.py --object cup --out out/study --split val    for tuning; publishes nothing
+
+Detector, teacher and student are trained on path-traced and analytic sets of the domain `synthetic`. The
+"captured" frames are of the domain `captured` (another index, light and background, noise, blur, occluders);
+their poses serve the evaluation only. OBJECT.toml beside this file holds what was tuned on their split `val`.
+Results go to docs/adaptation/OBJECT.json, of which page.py makes docs/adaptation.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+from page import RESULTS, table, write_page
+
+from dataset.session import Session
+from dataset.splits import split_session
+from s2p3 import objects
+from s2p3.config import ExperimentConfig, SelfSupervisionConfig, load
+from s2p3.evaluation import Evaluation, evaluate, find_objects
+from s2p3.provenance import checked_out_commit
+from s2p3.synthesis import CAPTURED, SYNTHETIC, Analytic, Domain, PathTraced, session_camera, synthesize
+from s2p3.synthesis.scene import Backend
+from s2p3.training import captured_crops, self_supervise, train_detector, train_student, train_teacher
+from s2p3.training.adaptation import adapt_batch_norm
+from s2p3.training.checkpoint import CheckpointInfo, save
+from s2p3.training.pretrain import load_teacher
+
+CAPTURED_FRAMES = 1600
+SHARES = {"train": 0.25, "val": 0.125}  # the rest, a thousand frames, is the test
+TRACED_HELD_OUT, ANALYTIC_HELD_OUT = 60, 300  # frames
+TRACED_SEED, ANALYTIC_SEED, HELD_OUT_SEED, CAPTURED_SEED = 0, 1, 2, 100
+
+Change = Callable[[SelfSupervisionConfig], SelfSupervisionConfig]
+
+TRAINED: dict[str, Change] = {
+    "student, AdaBN alone": lambda settings: replace(settings, steps=0, epochs=0),
+    "student, pose-only distillation": lambda settings: replace(
+        settings, pose_weight=1.0, mask_weight=0.0, normals_weight=0.0, physics="none"
+    ),
+    "student, without physics": lambda settings: replace(settings, physics="none"),
+    "student, DoLP physics (the paper's)": lambda settings: replace(settings, physics="dolp"),
+    "student, Stokes physics (ours)": lambda settings: replace(settings, physics="stokes"),
+}
+"""The rows that start from the pre-trained student, and how each departs from the object's settings."""
+
+BEFORE, TEACHER, ADAPTED_TEACHER = "student before", "teacher", "teacher, AdaBN alone"
+ROWS = (BEFORE, TEACHER, ADAPTED_TEACHER, *TRAINED)
+"""All rows, in the table's order."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """One object's study.
+
+    Attributes:
+        name: of the object.
+        out: folder of everything the study makes.
+        seeds: each trains teacher, student and every row anew; the sets and the detector are common.
+        traced, analytic: synthetic frames to train on, by backend.
+        split: of the captured frames, that is evaluated.
+    """
+
+    name: str
+    out: Path
+    seeds: tuple[int, ...]
+    traced: int
+    analytic: int
+    split: str
+
+    @property
+    def settings_file(self) -> Path:
+        return Path(__file__).with_name(f"{self.name}.toml")
+
+    @property
+    def captured(self) -> Path:
+        return self.out / "captured.h5"
+
+    @property
+    def detector(self) -> Path:
+        return self.out / "detector" / "detector.safetensors"
+
+    def training_sets(self) -> list[Path]:
+        sets = {"traced": self.traced, "analytic": self.analytic}
+        return [self.out / f"{name}.h5" for name, count in sets.items() if count]
+
+    def held_out_sets(self) -> list[Path]:
+        return [path.with_name(f"{path.stem}-held-out.h5") for path in self.training_sets()]
+
+    def checkpoint(self, row: str, seed: int) -> Path:
+        folder = self.out / f"seed-{seed}" / row.replace(" ", "-").replace(",", "").replace("'", "")
+        kind = {BEFORE: "student", TEACHER: "teacher", ADAPTED_TEACHER: "teacher"}.get(row, "adapted")
+        return folder / f"{kind}.safetensors"
+
+    def evaluation(self, row: str, seed: int, what: str) -> Path:
+        return self.checkpoint(row, seed).with_name(f"{what}.json")
+
+    def experiment(self, seed: int) -> ExperimentConfig:
+        config = load(self.settings_file)
+        return replace(
+            config,
+            teacher=replace(config.teacher, seed=seed),
+            student=replace(config.student, seed=seed),
+            self_supervision=replace(config.self_supervision, seed=seed),
+        )
+
+
+def make_sets(study: Study, workers: int) -> None:
+    """Renders the sets that are missing, and divides the captured frames."""
+    makers: list[tuple[Path, int, int, Domain, Backend]] = [
+        (study.captured, CAPTURED_FRAMES, CAPTURED_SEED, CAPTURED, Analytic())
+    ]
+    backends: dict[str, tuple[Backend, int, int, int]] = {}
+    if study.analytic:
+        backends["analytic"] = (Analytic(), study.analytic, ANALYTIC_SEED, ANALYTIC_HELD_OUT)
+    if study.traced:
+        backends["traced"] = (PathTraced.here(), study.traced, TRACED_SEED, TRACED_HELD_OUT)
+    for name, (backend, count, seed, held_out) in backends.items():
+        makers.append((study.out / f"{name}.h5", count, seed, SYNTHETIC, backend))
+        makers.append((study.out / f"{name}-held-out.h5", held_out, HELD_OUT_SEED, SYNTHETIC, backend))
+    model = objects.build(study.name)
+    for path, count, seed, domain, backend in makers:
+        if not path.exists():
+            print(f"{path.name}: {count} frames", flush=True)
+            print(synthesize(model, count, session_camera(), seed, path, workers, None, domain, backend))
+    with Session.open(study.captured) as session:
+        divided = "test" in session.splits
+    if not divided:
+        split_session(study.captured, "frame", **SHARES, seed=CAPTURED_SEED)
+
+
+def train_network(study: Study, what: str, seed: int) -> None:
+    """Pre-trains the detector, a teacher or a student."""
+    config, model, cache = study.experiment(seed), objects.build(study.name), study.out / "crops"
+    if what == "detector":
+        train_detector(study.training_sets(), model, config, study.detector.parent, _silent)
+    elif what == TEACHER:
+        out = study.checkpoint(TEACHER, seed).parent
+        train_teacher(study.training_sets(), model, config, out, cache, _silent)
+    else:
+        out = study.checkpoint(BEFORE, seed).parent
+        train_student(study.training_sets(), model, config, out, cache, on_step=_silent)
+
+
+def adapt_network(study: Study, row: str, seed: int) -> None:
+    """Trains one row on the captured split `train`; no pose is read."""
+    config, model = study.experiment(seed), objects.build(study.name)
+    with Session.open(study.captured) as session:
+        indices = [int(index) for index in session.splits["train"]]
+        found = find_objects(session, indices, study.detector, model.name, _silent)
+        crops = captured_crops(session, indices, found, config.input)
+    teacher, student = study.checkpoint(TEACHER, seed), study.checkpoint(BEFORE, seed)
+    path = study.checkpoint(row, seed)
+    if row == ADAPTED_TEACHER:
+        network, info = load_teacher(teacher, model.name)
+        adapt_batch_norm(network, crops, model.refractive_index, config, config.self_supervision)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(path, network.state_dict(), CheckpointInfo.of("teacher", "AdaBN", model, 0, config, info.data))
+    else:
+        settings = TRAINED[row](config.self_supervision)
+        self_supervise(crops, model, teacher, student, path.parent, settings, _silent)
+
+
+def judge_network(study: Study, row: str, seed: int, what: str) -> None:
+    """Evaluates one row on `what`: a split of the captured frames, or the held-out synthetic set so named."""
+    model = objects.build(study.name)
+    captured = what in (*SHARES, "test")
+    with Session.open(study.captured if captured else study.out / f"{what}.h5") as session:
+        indices = [int(index) for index in session.splits[what]] if captured else list(range(len(session)))
+        network = study.checkpoint(row, seed)
+        run = evaluate(session, indices, model, network, study.detector, on_step=_silent)
+    run.save(study.evaluation(row, seed, what))
+
+
+def run_all(jobs: Iterable[tuple[Path, Callable[..., None], tuple[Any, ...]]], workers: int) -> None:
+    """Runs the jobs whose file is missing, a process and a thread each."""
+    missing = [(path, run, arguments) for path, run, arguments in jobs if not path.exists()]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, torch.set_num_threads, (1,)) as pool:
+        started = {pool.submit(run, *arguments): path for path, run, arguments in missing}
+        for done in as_completed(started):
+            done.result()
+            print(f"{time.strftime('%H:%M:%S')} {started[done].parent.name}/{started[done].name}", flush=True)
+
+
+def run_study(study: Study, workers: int) -> None:
+    """Every step whose file is missing."""
+    study.out.mkdir(parents=True, exist_ok=True)
+    make_sets(study, workers)
+    pretraining = [(study.detector, train_network, (study, "detector", study.seeds[0]))]
+    for seed in study.seeds:
+        for row in (TEACHER, BEFORE):
+            pretraining.append((study.checkpoint(row, seed), train_network, (study, row, seed)))
+    run_all(pretraining, workers)
+    adapted = (ADAPTED_TEACHER, *TRAINED)
+    run_all(
+        [
+            (study.checkpoint(row, seed), adapt_network, (study, row, seed))
+            for seed in study.seeds
+            for row in adapted
+        ],
+        workers,
+    )
+    held_out = [path.stem for path in study.held_out_sets()]
+    judged = [(row, seed, study.split) for seed in study.seeds for row in ROWS]
+    judged += [(row, seed, what) for seed in study.seeds for row in (TEACHER, BEFORE) for what in held_out]
+    run_all([(study.evaluation(*job), judge_network, (study, *job)) for job in judged], workers)
+
+
+def result_of(study: Study) -> dict[str, Any]:
+    """What the study found, ready for JSON."""
+
+    def figures(row: str, what: str) -> list[dict[str, Any]]:
+        found = []
+        for seed in study.seeds:
+            summary = Evaluation.load(study.evaluation(row, seed, what)).summary
+            names = (
+                "targets",
+                "missed",
+                "recall_10",
+                "recall_5",
+                "rotation_deg",
+                "translation_mm",
+                "depth_mm",
+            )
+            row_figures = {name: getattr(summary, name) for name in names}
+            found.append({"seed": seed, "metric": summary.metric, **row_figures})
+        return found
+
+    def above(row: str, other: str) -> list[dict[str, float]]:
+        found = []
+        for seed in study.seeds:
+            runs = [Evaluation.load(study.evaluation(name, seed, study.split)) for name in (row, other)]
+            difference = runs[0].above(runs[1])["recall_10"]
+            low, high = difference.interval
+            found.append({"seed": seed, "value": difference.value, "low": low, "high": high})
+        return found
+
+    return {
+        "split": study.split,
+        "rows": {row: figures(row, study.split) for row in ROWS},
+        "in_domain": {
+            path.stem: {row: figures(row, path.stem) for row in (TEACHER, BEFORE)}
+            for path in study.held_out_sets()
+        },
+        "differences": {
+            row: {other: above(row, other) for other in ROWS if other != row} for row in ROWS[3:]
+        },
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--object", choices=objects.NAMES, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--traced", type=int, default=400, help="path-traced frames to train on")
+    parser.add_argument("--analytic", type=int, default=1800, help="analytic frames to train on")
+    parser.add_argument(
+        "--split", choices=(*SHARES, "test"), default="test", help="captured frames to judge by"
+    )
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    study = Study(
+        options.object, options.out, tuple(options.seeds), options.traced, options.analytic, options.split
+    )
+    run_study(study, options.workers)
+    result = result_of(study)
+    print(table(result))
+    if options.split == "test":
+        publish(study.name, result)
+    return 0
+
+
+def publish(name: str, result: dict[str, Any]) -> None:
+    """Keeps a result with command, commit and date, and makes the page of all that are kept."""
+    commit = checked_out_commit("docs/adaptation", "docs/adaptation.md")
+    command = f"python tools/adaptation/study.py {' '.join(sys.argv[1:])}"
+    kept = {"command": command, "commit": commit, "date": date.today().isoformat(), "result": result}
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f"{name}.json").write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+    write_page()
+
+
+def _silent(*_: object) -> None:
+    """Instead of a progress bar in a worker."""
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -44,8 +44,9 @@ def create(path: Path) -> h5py.File:
     except FileExistsError as error:
         raise SessionError(f"{path} already exists; choose another name or remove it first") from error
     except OSError as error:
+        why = os.strerror(error.errno) if error.errno else str(error).splitlines()[0]
         raise SessionError(
-            f"{path} cannot be created ({error}); check the folder and its permissions"
+            f"{path} cannot be created ({why}); check the folder and its permissions"
         ) from error
 
 

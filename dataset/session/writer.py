@@ -47,7 +47,7 @@ close a file on a full disk nor, in the same process, open it again (our choice)
 
 class SessionWriter:
     """Writes one session file. A context manager: a clean exit marks the file complete, an exception (Ctrl-C
-    included) leaves it closed and marked incomplete.
+    included) leaves it closed and marked incomplete; a file in which nothing was recorded yet is removed.
 
     Every frame is on its way to the disk when `add_frame` returns: a killed process loses none of them.
     Methods may be called from several threads.
@@ -129,6 +129,8 @@ class SessionWriter:
             return
         with suppress(SessionError):  # the error on its way out is the one the user must see
             self.close()
+        if not (self._frames or self._samples or self._drops or self._pauses):
+            self.path.unlink(missing_ok=True)  # nothing was recorded: the name is free for the next attempt
 
     def __len__(self) -> int:
         return self._frames

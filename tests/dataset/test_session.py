@@ -268,6 +268,24 @@ def test_an_exception_leaves_a_closed_incomplete_file(
         write_split(path, "train", [0])
 
 
+def test_an_exception_before_anything_was_recorded_leaves_the_name_free(
+    tmp_path: Path, camera: CameraInfo
+) -> None:
+    path = tmp_path / "s.h5"
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt), SessionWriter(path, "sequence", camera):
+            raise KeyboardInterrupt
+        assert not path.exists()
+
+
+def test_a_place_where_no_file_can_be_is_refused_in_one_line(camera: CameraInfo) -> None:
+    with pytest.raises(SessionError) as caught:
+        SessionWriter("/proc/s.h5", "sequence", camera)
+    assert str(caught.value) == (
+        "/proc/s.h5 cannot be created (No such file or directory); check the folder and its permissions"
+    )
+
+
 def test_the_writer_refuses_what_does_not_fit(
     tmp_path: Path, camera: CameraInfo, make_frame: Callable[..., RawFrame]
 ) -> None:

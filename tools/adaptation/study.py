@@ -16,13 +16,14 @@ import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from page import RESULTS, table, write_page
 
@@ -31,6 +32,7 @@ from dataset.splits import split_session
 from s2p3 import objects
 from s2p3.config import ExperimentConfig, SelfSupervisionConfig, load
 from s2p3.evaluation import Evaluation, evaluate, find_objects
+from s2p3.networks.detector import Detection
 from s2p3.provenance import checked_out_commit
 from s2p3.synthesis import CAPTURED, SYNTHETIC, Analytic, Domain, PathTraced, session_camera, synthesize
 from s2p3.synthesis.scene import Backend
@@ -93,6 +95,16 @@ class Study:
     def detector(self) -> Path:
         return self.out / "detector" / "detector.safetensors"
 
+    @property
+    def found(self) -> Path:
+        """The detector's answers for all captured frames: every row of every seed sees the same."""
+        return self.out / "detector" / "found.npz"
+
+    @property
+    def times(self) -> Path:
+        """Seconds that each step took so far."""
+        return self.out / "times.json"
+
     def training_sets(self) -> list[Path]:
         sets = {"traced": self.traced, "analytic": self.analytic}
         return [self.out / f"{name}.h5" for name, count in sets.items() if count]
@@ -143,10 +155,12 @@ def make_sets(study: Study, workers: int) -> None:
 
 
 def train_network(study: Study, what: str, seed: int) -> None:
-    """Pre-trains the detector, a teacher or a student."""
+    """Pre-trains a teacher, a student, or the detector, which then looks at all captured frames."""
     config, model, cache = study.experiment(seed), objects.build(study.name), study.out / "crops"
     if what == "detector":
-        train_detector(study.training_sets(), model, config, study.detector.parent, _silent)
+        if not study.detector.exists():
+            train_detector(study.training_sets(), model, config, study.detector.parent, _silent)
+        find_captured(study)
     elif what == TEACHER:
         out = study.checkpoint(TEACHER, seed).parent
         train_teacher(study.training_sets(), model, config, out, cache, _silent)
@@ -155,13 +169,32 @@ def train_network(study: Study, what: str, seed: int) -> None:
         train_student(study.training_sets(), model, config, out, cache, on_step=_silent)
 
 
+def find_captured(study: Study) -> None:
+    """Runs the detector over all captured frames and keeps what it found."""
+    with Session.open(study.captured) as session:
+        found = find_objects(session, range(len(session)), study.detector, study.name, _silent)
+        shape = session.stokes(0).s0.shape
+    masks = [np.zeros(shape, bool) if one is None else one.mask for one in found]
+    boxes = [np.zeros(4) if one is None else one.box_xywh for one in found]
+    scores = [np.nan if one is None else one.score for one in found]
+    np.savez_compressed(study.found, mask=np.packbits(masks, axis=-1), box=boxes, score=scores)
+
+
+def found_in(study: Study, indices: Sequence[int]) -> list[Detection | None]:
+    """What the detector found in captured frames."""
+    with np.load(study.found) as kept, Session.open(study.captured) as session:
+        width = session.working_intrinsics.width
+        masks = np.unpackbits(kept["mask"][indices], axis=-1, count=width).astype(bool)
+        rows = zip(kept["box"][indices], masks, kept["score"][indices], strict=True)
+        return [None if np.isnan(score) else Detection(box, mask, float(score)) for box, mask, score in rows]
+
+
 def adapt_network(study: Study, row: str, seed: int) -> None:
     """Trains one row on the captured split `train`; no pose is read."""
     config, model = study.experiment(seed), objects.build(study.name)
     with Session.open(study.captured) as session:
         indices = [int(index) for index in session.splits["train"]]
-        found = find_objects(session, indices, study.detector, model.name, _silent)
-        crops = captured_crops(session, indices, found, config.input)
+        crops = captured_crops(session, indices, found_in(study, indices), config.input)
     teacher, student = study.checkpoint(TEACHER, seed), study.checkpoint(BEFORE, seed)
     path = study.checkpoint(row, seed)
     if row == ADAPTED_TEACHER:
@@ -180,12 +213,17 @@ def judge_network(study: Study, row: str, seed: int, what: str) -> None:
     captured = what in (*SHARES, "test")
     with Session.open(study.captured if captured else study.out / f"{what}.h5") as session:
         indices = [int(index) for index in session.splits[what]] if captured else list(range(len(session)))
+        found = found_in(study, indices) if captured else None
         network = study.checkpoint(row, seed)
-        run = evaluate(session, indices, model, network, study.detector, on_step=_silent)
+        run = evaluate(session, indices, model, network, study.detector, found, _silent)
     run.save(study.evaluation(row, seed, what))
 
 
-def run_all(jobs: Iterable[tuple[Path, Callable[..., None], tuple[Any, ...]]], workers: int) -> None:
+Job = tuple[Path, Callable[..., None], tuple[Any, ...]]
+"""A file, the function that makes it, and that function's arguments."""
+
+
+def run_all(jobs: Iterable[Job], workers: int) -> None:
     """Runs the jobs whose file is missing, a process and a thread each."""
     missing = [(path, run, arguments) for path, run, arguments in jobs if not path.exists()]
     context = multiprocessing.get_context("spawn")
@@ -199,25 +237,38 @@ def run_all(jobs: Iterable[tuple[Path, Callable[..., None], tuple[Any, ...]]], w
 def run_study(study: Study, workers: int) -> None:
     """Every step whose file is missing."""
     study.out.mkdir(parents=True, exist_ok=True)
-    make_sets(study, workers)
-    pretraining = [(study.detector, train_network, (study, "detector", study.seeds[0]))]
+    pretraining: list[Job] = [(study.found, train_network, (study, "detector", study.seeds[0]))]
+    adaptation: list[Job] = []
+    evaluation: list[Job] = []
     for seed in study.seeds:
         for row in (TEACHER, BEFORE):
             pretraining.append((study.checkpoint(row, seed), train_network, (study, row, seed)))
-    run_all(pretraining, workers)
-    adapted = (ADAPTED_TEACHER, *TRAINED)
-    run_all(
-        [
-            (study.checkpoint(row, seed), adapt_network, (study, row, seed))
-            for seed in study.seeds
-            for row in adapted
-        ],
-        workers,
-    )
-    held_out = [path.stem for path in study.held_out_sets()]
-    judged = [(row, seed, study.split) for seed in study.seeds for row in ROWS]
-    judged += [(row, seed, what) for seed in study.seeds for row in (TEACHER, BEFORE) for what in held_out]
-    run_all([(study.evaluation(*job), judge_network, (study, *job)) for job in judged], workers)
+        for row in (ADAPTED_TEACHER, *TRAINED):
+            adaptation.append((study.checkpoint(row, seed), adapt_network, (study, row, seed)))
+        judged = [(row, study.split) for row in ROWS]
+        judged += [(row, path.stem) for row in (TEACHER, BEFORE) for path in study.held_out_sets()]
+        for row, what in judged:
+            evaluation.append((study.evaluation(row, seed, what), judge_network, (study, row, seed, what)))
+    timed(study, "sets", lambda: make_sets(study, workers))
+    timed(study, "pre-training", lambda: run_all(pretraining, workers))
+    timed(study, "adaptation", lambda: run_all(adaptation, workers))
+    timed(study, "evaluation", lambda: run_all(evaluation, workers))
+
+
+def timed(study: Study, step: str, run: Callable[[], None]) -> None:
+    """Runs a step and adds the seconds it took to those of earlier runs, also where it is stopped."""
+    started = time.monotonic()
+    try:
+        run()
+    finally:
+        times = times_of(study)
+        times[step] = times.get(step, 0.0) + time.monotonic() - started
+        study.times.write_text(json.dumps(times), encoding="utf-8")
+
+
+def times_of(study: Study) -> dict[str, float]:
+    """Seconds by step."""
+    return json.loads(study.times.read_text(encoding="utf-8")) if study.times.exists() else {}
 
 
 def result_of(study: Study) -> dict[str, Any]:
@@ -251,6 +302,7 @@ def result_of(study: Study) -> dict[str, Any]:
 
     return {
         "split": study.split,
+        "minutes": {step: round(seconds / 60, 1) for step, seconds in times_of(study).items()},
         "rows": {row: figures(row, study.split) for row in ROWS},
         "in_domain": {
             path.stem: {row: figures(row, path.stem) for row in (TEACHER, BEFORE)}

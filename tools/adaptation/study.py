@@ -165,8 +165,8 @@ def train_network(study: Study, what: str, seed: int) -> None:
         out = study.checkpoint(TEACHER, seed).parent
         train_teacher(study.training_sets(), model, config, out, cache, _silent)
     else:
-        out = study.checkpoint(BEFORE, seed).parent
-        train_student(study.training_sets(), model, config, out, cache, on_step=_silent)
+        out, teacher = study.checkpoint(BEFORE, seed).parent, study.checkpoint(TEACHER, seed)
+        train_student(study.training_sets(), model, config, out, cache, teacher, _silent)
 
 
 def find_captured(study: Study) -> None:
@@ -237,12 +237,13 @@ def run_all(jobs: Iterable[Job], workers: int) -> None:
 def run_study(study: Study, workers: int) -> None:
     """Every step whose file is missing."""
     study.out.mkdir(parents=True, exist_ok=True)
-    pretraining: list[Job] = [(study.found, train_network, (study, "detector", study.seeds[0]))]
+    guides: list[Job] = [(study.found, train_network, (study, "detector", study.seeds[0]))]
+    students: list[Job] = []  # they may start from their teacher's encoders
     adaptation: list[Job] = []
     evaluation: list[Job] = []
     for seed in study.seeds:
-        for row in (TEACHER, BEFORE):
-            pretraining.append((study.checkpoint(row, seed), train_network, (study, row, seed)))
+        for jobs, row in ((guides, TEACHER), (students, BEFORE)):
+            jobs.append((study.checkpoint(row, seed), train_network, (study, row, seed)))
         for row in (ADAPTED_TEACHER, *TRAINED):
             adaptation.append((study.checkpoint(row, seed), adapt_network, (study, row, seed)))
         judged = [(row, study.split) for row in ROWS]
@@ -250,7 +251,8 @@ def run_study(study: Study, workers: int) -> None:
         for row, what in judged:
             evaluation.append((study.evaluation(row, seed, what), judge_network, (study, row, seed, what)))
     timed(study, "sets", lambda: make_sets(study, workers))
-    timed(study, "pre-training", lambda: run_all(pretraining, workers))
+    timed(study, "detector and teachers", lambda: run_all(guides, workers))
+    timed(study, "students", lambda: run_all(students, workers))
     timed(study, "adaptation", lambda: run_all(adaptation, workers))
     timed(study, "evaluation", lambda: run_all(evaluation, workers))
 

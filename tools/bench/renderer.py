@@ -10,8 +10,8 @@ spanning two thirds of the image, as in a box enlarged by half:
     fd_cos_rot, fd_cos_trans             cosine between the mask's gradients and central finite differences of
                                          a mask rendered sixteen times finer, over 48 random poses
     recovered_pct, recovered_add_pct     of `--views` random poses, those found again from 10 deg and 5 % of
-                                         the diameter off: see `pose_recovery.recovered`. One standard error
-                                         of 90 percent of 144 is 2.5 points
+                                         the diameter off, on pictures of up to 256x256 pixels: see
+                                         `pose_recovery.recovered`. recovered_128_pct: of up to 128x128
     mitsuba_projective_ms_128            the peer: Mitsuba's direct_projective for one mask and its gradient,
                                          16 samples per pixel (--without-mitsuba leaves it out)
 """

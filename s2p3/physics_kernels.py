@@ -83,7 +83,7 @@ def priors(
             polarized = np.sqrt(s1 * s1 + s2 * s2)
             s0 = max(max(s0s[y, x], polarized), dark)
             m = polarized / (s0 + np.sqrt((s0 - polarized) * (s0 + polarized)))
-            half[x], root[x] = m, np.sqrt(m)
+            half[x] = m
             # The azimuth, half the angle of (S1, S2), bisects that and the nearer half of the S1 axis.
             longer = polarized + abs(s1)
             scale = _rsqrt(max(_TWO * polarized * longer, _TINY))
@@ -91,12 +91,13 @@ def priors(
             longer = longer if polarized > dark else _ONE
             cosine[x], turned = (longer, shorter) if s1 >= 0 else (shorter, longer)
             sine[x] = -turned if s2 < 0 else turned
-            c = _rsqrt(_ONE + us[x] * us[x] + v * v)
-            ray_z[x], bend[x] = c, _ONE / (_ONE + c)
 
         ox, oy, oz = out[0, row], out[1, row], out[2, row]
         for x in range(width):
-            m, c = min(half[x], grazing), ray_z[x]
+            # Roots that the later loops need, too: here the processor's divider would be idle.
+            c, root[x] = _rsqrt(_ONE + us[x] * us[x] + v * v), np.sqrt(half[x])
+            ray_z[x], bend[x] = c, _ONE / (_ONE + c)
+            m = min(half[x], grazing)
             g = _rsqrt((_ONE + m) * (a * (_ONE + m) - _TWO * index * (_ONE - m)))
             sin, z = _TWO * index * min(root[x], root_grazing) * g, (_ONE + m - index * (_ONE - m)) * g
             normal = _camera_frame(cosine[x] * sin, -sine[x] * sin, z, us[x] * c, v * c, c, bend[x])

@@ -36,10 +36,10 @@ def table(result: dict[str, Any]) -> str:
     """One study as Markdown."""
     first = next(iter(result["rows"].values()))
     seeds = ", ".join(str(figures["seed"]) for figures in first)
-    minutes = ", ".join(f"{step} {spent:g}" for step, spent in result["minutes"].items())
+    minutes = ", ".join(f"{what} {spent:g}" for what, spent in result["minutes"].items())
     return "\n".join(
         [
-            f"Minutes on two cores: {minutes}; {sum(result['minutes'].values()):.0f} in all.",
+            f"Minutes on one core: {minutes}.",
             "",
             f"{first[0]['targets']} targets of the split `{result['split']}`, seeds {seeds}; "
             f"recall by {first[0]['metric']}, percent.",

@@ -100,11 +100,6 @@ class Study:
         """The detector's answers for all captured frames: every row of every seed sees the same."""
         return self.out / "detector" / "found.npz"
 
-    @property
-    def times(self) -> Path:
-        """Seconds that each step took so far."""
-        return self.out / "times.json"
-
     def training_sets(self) -> list[Path]:
         sets = {"traced": self.traced, "analytic": self.analytic}
         return [self.out / f"{name}.h5" for name, count in sets.items() if count]
@@ -250,27 +245,29 @@ def run_study(study: Study, workers: int) -> None:
         judged += [(row, path.stem) for row in (TEACHER, BEFORE) for path in study.held_out_sets()]
         for row, what in judged:
             evaluation.append((study.evaluation(row, seed, what), judge_network, (study, row, seed, what)))
-    timed(study, "sets", lambda: make_sets(study, workers))
-    timed(study, "detector and teachers", lambda: run_all(guides, workers))
-    timed(study, "students", lambda: run_all(students, workers))
-    timed(study, "adaptation", lambda: run_all(adaptation, workers))
-    timed(study, "evaluation", lambda: run_all(evaluation, workers))
+    make_sets(study, workers)
+    run_all(guides, workers)
+    run_all(students, workers)
+    run_all(adaptation, workers)
+    run_all(evaluation, workers)
 
 
-def timed(study: Study, step: str, run: Callable[[], None]) -> None:
-    """Runs a step and adds the seconds it took to those of earlier runs, also where it is stopped."""
-    started = time.monotonic()
-    try:
-        run()
-    finally:
-        times = times_of(study)
-        times[step] = times.get(step, 0.0) + time.monotonic() - started
-        study.times.write_text(json.dumps(times), encoding="utf-8")
+def minutes_of(study: Study) -> dict[str, float]:
+    """What the trainings took, on average, a process and a thread each: from their logs."""
 
+    def spent(checkpoints: Iterable[Path]) -> float:
+        logs = [path.with_suffix(".log.jsonl").read_text(encoding="utf-8") for path in checkpoints]
+        return round(float(np.mean([json.loads(log.splitlines()[-1])["seconds"] for log in logs])) / 60, 1)
 
-def times_of(study: Study) -> dict[str, float]:
-    """Seconds by step."""
-    return json.loads(study.times.read_text(encoding="utf-8")) if study.times.exists() else {}
+    trained = [row for row in TRAINED if row != "student, AdaBN alone"]
+    return {
+        "the detector": spent([study.detector]),
+        "a teacher": spent(study.checkpoint(TEACHER, seed) for seed in study.seeds),
+        "a student": spent(study.checkpoint(BEFORE, seed) for seed in study.seeds),
+        "a self-supervised row": spent(
+            study.checkpoint(row, seed) for seed in study.seeds for row in trained
+        ),
+    }
 
 
 def result_of(study: Study) -> dict[str, Any]:
@@ -304,7 +301,7 @@ def result_of(study: Study) -> dict[str, Any]:
 
     return {
         "split": study.split,
-        "minutes": {step: round(seconds / 60, 1) for step, seconds in times_of(study).items()},
+        "minutes": minutes_of(study),
         "rows": {row: figures(row, study.split) for row in ROWS},
         "in_domain": {
             path.stem: {row: figures(row, path.stem) for row in (TEACHER, BEFORE)}

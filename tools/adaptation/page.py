@@ -16,11 +16,13 @@ HEAD = """# Does self-supervision help?
 
 Every table on this page was made by the command above it, at the commit beside it. Teacher and student are
 trained on path-traced and analytic images of the [domain](synthesis.md#domains) `synthetic`; the frames
-they must cope with are of the domain `captured`: another refractive index, harder lamps, a polarized
-background, leaking polarizers, blur, noise, and something in front of the object. They stand in for a
-recorded sequence, and have one advantage over it: exact truth. Losses and images share one Fresnel model,
-so real surfaces will be harder. Settings were tuned on the captured split `val`; the split `test` is looked
-at here only. Boxes and masks are the detector's, and a target without a detection counts as failed.
+they must cope with are of the domain `captured`: dark, noisy and blurred, under many hard lamps, with another
+refractive index, leaking polarizers, mirroring and polarized backgrounds, and things in front of the object.
+How hard that domain is is our choice: hard enough for the pre-trained networks to fail on every second frame,
+before any of them was adapted to it. It stands in for a recorded sequence, and has one advantage over it:
+exact truth. Losses and images share one Fresnel model, so real surfaces will be harder. Settings were tuned
+on the captured split `val`; the split `test` is looked at here only. Boxes and masks are the detector's, and
+a target without a detection counts as failed.
 """
 CONTROLS = (
     "student before",

@@ -60,12 +60,12 @@ for line in sys.stdin:  # one recorder a line, each a process of its own, forked
     path, how, largest = line.split()
     child = os.fork()
     if child == 0:
+        print("started", os.getpid(), flush=True)
         try:
             record(path, how, int(largest))
         except Exception as error:
             print("error", type(error).__name__, " ".join(str(error).split()), flush=True)
         os._exit(1)
-    print("started", child, flush=True)
     os.waitpid(child, 0)
     print("ended", flush=True)
 """

@@ -195,6 +195,9 @@ class SelfSupervisionConfig(StageConfig):
     all."""
     adapt_teacher: bool = True
     """Whether the teacher's BatchNorm statistics are re-estimated too."""
+    freeze_norms: bool = False
+    """Whether the student's BatchNorm statistics stay as they are while it learns, or follow the captured
+    frames: those hold the object's size in the box, too, which tells its distance."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,9 @@
-"""AdaBN (Li et al. 2016): BatchNorm statistics re-estimated on the captured domain, weights untouched. Our
-addition."""
+"""What becomes of BatchNorm statistics in another domain: they follow, are re-estimated first (AdaBN, Li et
+al. 2016; our addition), or are frozen."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
@@ -14,6 +16,9 @@ from s2p3.training.batches import form_input
 from s2p3.training.crops import Crops
 from s2p3.training.loop import sample_indices
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 _BATCH = 32
 _MOMENTUM = 0.1
 
@@ -23,6 +28,24 @@ def set_momentum(network: nn.Module, momentum: float) -> None:
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = momentum
+
+
+def freeze_norms(network: nn.Module) -> None:
+    """Makes every BatchNorm of `network` keep its statistics in training, too; weights and names stay."""
+    for parent in list(network.modules()):
+        for name, child in parent.named_children():
+            if type(child) is nn.BatchNorm2d:
+                frozen = _FrozenBatchNorm(child.num_features, child.eps, affine=child.affine)
+                frozen.load_state_dict(child.state_dict())
+                setattr(parent, name, frozen.eval())
+
+
+class _FrozenBatchNorm(nn.BatchNorm2d):
+    """A BatchNorm that is always in evaluation mode."""
+
+    def train(self, mode: bool = True) -> Self:
+        del mode
+        return super().train(False)
 
 
 @torch.no_grad()

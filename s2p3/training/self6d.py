@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dataset.errors import ToolkitError
 from s2p3 import appearance_losses as appearance
@@ -25,11 +24,11 @@ from s2p3.config import Self6DConfig
 from s2p3.inputs import NetworkInput
 from s2p3.networks.perceptual import Perceptual
 from s2p3.networks.pose_head import decode_pose
-from s2p3.networks.student import Student
-from s2p3.networks.teacher import Teacher, pose_of
+from s2p3.networks.teacher import pose_of
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
+from s2p3.training.adaptation import freeze_norms
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
 from s2p3.training.loop import Forward, Losses, optimize
@@ -44,9 +43,6 @@ from s2p3.training.self_supervised import (
     load_pair,
     visible_surface,
 )
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 
 def self_supervise_rgbd(
@@ -76,11 +72,12 @@ def self_supervise_rgbd(
     perceptual = Perceptual.load(Path(settings.lpips_weights)) if settings.lpips_weights else None
     mesh = RenderMesh.from_mesh(model.mesh)
     labels = make_labels(pair.teacher, crops, model, mesh, pair.config)
+    freeze_norms(pair.student)
     data = CapturedData(crops, labels, mesh, model.refractive_index, pair.config)
     objective = _Objective(mesh, *model_tensors(model), model.diameter, perceptual, settings)
     path, hashes = out / "adapted.safetensors", {"crops": crops_hash(crops)}
     trained = optimize(
-        _FrozenNorm(pair.student),
+        pair.student,
         data,
         objective,
         settings,
@@ -92,26 +89,8 @@ def self_supervise_rgbd(
     )
     config = replace(pair.config, self6d=settings)
     info = CheckpointInfo.of("student", "self-supervised", model, trained.step, config, hashes)
-    checkpoint.save(path, trained.network.network.state_dict(), info)
+    checkpoint.save(path, trained.network.state_dict(), info)
     return path
-
-
-class _FrozenNorm(nn.Module):
-    """A network whose BatchNorm keeps its statistics while it is trained."""
-
-    def __init__(self, network: Student | Teacher) -> None:
-        super().__init__()
-        self.network = network
-
-    def train(self, mode: bool = True) -> Self:
-        super().train(mode)
-        for module in self.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.eval()
-        return self
-
-    def forward(self, image: Tensor, other: Tensor) -> object:
-        return self.network(image, other)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from s2p3.networks.teacher import MAP_STRIDE, Teacher, TeacherOutput, pose_of
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
-from s2p3.training.adaptation import adapt_batch_norm, set_momentum
+from s2p3.training.adaptation import adapt_batch_norm, freeze_norms, set_momentum
 from s2p3.training.batches import form_input
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
@@ -76,6 +76,8 @@ def self_supervise(
     labels = make_labels(pair.teacher, crops, model, mesh, pair.config)
     path = out / "adapted.safetensors"
     report_signal(captured_signal(crops, labels.rotation, labels.translation, model), path)
+    if settings.freeze_norms:
+        freeze_norms(pair.student)
     set_momentum(pair.student, _BATCH_NORM_MOMENTUM)
     if settings.teacher == "ema":
         network = _following(pair, student, settings)

@@ -135,6 +135,18 @@ def test_the_total_is_the_weighted_sum_of_the_terms(
     assert all(getattr(kept, name) == value for name, value in changes.items())
 
 
+@pytest.mark.parametrize("frozen", [True, False])
+def test_frozen_norms_keep_their_statistics(
+    frozen: bool, cup_session: Path, cup: ObjectModel, direct: dict[str, Path], tmp_path: Path
+) -> None:
+    _, out = run(cup_session, cup, direct, tmp_path, adapt_batches=0, freeze_norms=frozen)
+    before, after = load_file(direct["student"]), load_file(out)
+    kept = {name for name, value in before.items() if torch.equal(value, after[name])}
+    statistics = {name for name in before if "running_" in name}
+    assert kept >= statistics if frozen else not kept & statistics
+    assert not kept & {name for name in before if name.endswith(".weight")}
+
+
 def test_a_depth_loss_without_depth_is_refused(
     cup_session: Path, cup: ObjectModel, direct: dict[str, Path], tmp_path: Path
 ) -> None:

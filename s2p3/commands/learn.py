@@ -27,7 +27,7 @@ def synthesize(
     simplify_mm: OptionalNumber = None,
     intrinsics: OptionalPath = None,
     views_like: OptionalPath = None,
-    domain: Literal["synthetic", "captured"] = "synthetic",
+    domain: Literal["plain", "synthetic", "captured"] = "synthetic",
     seed: int = 0,
     workers: int = 2,
     backend: Literal["analytic", "path-traced"] = "analytic",
@@ -46,7 +46,8 @@ def synthesize(
         simplify_mm: render a mesh of fewer faces whose surface is nowhere further off than this.
         intrinsics: calibration.json of the camera to imitate; the paper's camera by default.
         views_like: session whose poses of the object the views are distributed like.
-        domain: synthetic to train on; captured has a denser material, harder light, more noise, occlusion.
+        domain: synthetic to train on; plain varies less; captured has a denser material, harder light, more
+            noise, occlusion.
         seed: the same seed, the same frames.
         workers: processes that render, or Ray actors.
         backend: analytic is Fresnel reflection of lights and environment, without shadows; path-traced is

@@ -5,7 +5,7 @@ Two backends draw the same scenes: `Analytic`, fast and without shadows, and `Pa
 
 from s2p3.synthesis.analytic_scene import Analytic
 from s2p3.synthesis.depth import DepthSensor, add_depth
-from s2p3.synthesis.domain import CAPTURED, DOMAINS, SYNTHETIC, Domain
+from s2p3.synthesis.domain import CAPTURED, DOMAINS, PLAIN, SYNTHETIC, Domain
 from s2p3.synthesis.drawing import draw_scene
 from s2p3.synthesis.frames import Recipe, session_camera
 from s2p3.synthesis.generate import synthesize
@@ -18,6 +18,7 @@ from s2p3.synthesis.views import Views, ViewsLike
 __all__ = [
     "CAPTURED",
     "DOMAINS",
+    "PLAIN",
     "SYNTHETIC",
     "Analytic",
     "Backend",

@@ -53,29 +53,43 @@ class Domain:
 SYNTHETIC = Domain()
 """The domain that `synthesize` draws from unless told otherwise."""
 
+PLAIN = Domain(
+    index_scale=(1.0, 1.0),
+    dolp_scale=(1.0, 1.0),
+    haze_dolp=(0.0, 0.0),
+    clutter=(0, 0),
+    occluder_share=0.0,
+    blur_px=(0.3, 0.4),
+    level=(0.25, 0.4),
+    full_well=(40000.0, 42000.0),
+    read_noise=(4.0, 5.0),
+)
+"""What one renders first: the material as the model says, nothing beside the object, a good camera. Light,
+table and views vary as in `SYNTHETIC`; whatever else a captured image holds is missing."""
+
 CAPTURED = Domain(
     specular_share=0.9,
     index_scale=(1.05, 1.085),
     dolp_scale=(0.88, 0.96),
-    lamps=(4, 8),
-    lamp_glare=(10.0, 40.0),
+    lamps=(3, 6),
+    lamp_glare=(3.0, 14.0),
     lamp_sharpness=(20.0, 120.0),
     ambient=(0.05, 0.3),
     specular_sky=(0.3, 1.0),
     diffuse_sky=(0.03, 0.12),
     matte_table_share=0.1,
-    table_gloss=(0.6, 1.0),
-    haze_dolp=(0.3, 0.7),
-    clutter=(3, 6),
+    table_gloss=(0.3, 1.0),
+    haze_dolp=(0.1, 0.4),
+    clutter=(1, 4),
     occluder_share=0.125,
-    blur_px=(1.5, 2.5),
-    level=(0.04, 0.12),
-    full_well=(5000.0, 9000.0),
-    read_noise=(20.0, 45.0),
+    blur_px=(0.6, 1.2),
+    level=(0.1, 0.3),
+    full_well=(8000.0, 16000.0),
+    read_noise=(12.0, 30.0),
 )
-"""A stand-in for images captured in a hurry, outside of what `SYNTHETIC` covers: dark and noisy frames of a
-moving camera, many hard lamps, mirroring and polarized backgrounds crowded with other things, leaking
-polarizers, a denser material (1.6 where the model says 1.5), and now and then something before the object."""
+"""A stand-in for captured images, wider than the gap within `SYNTHETIC`: a denser material (1.6 where the
+model says 1.5), harder and more lamps, glossier and more polarized backgrounds, leaking polarizers, blur,
+noise, and the object covered in about every seventh frame."""
 
-DOMAINS = {"synthetic": SYNTHETIC, "captured": CAPTURED}
+DOMAINS = {"plain": PLAIN, "synthetic": SYNTHETIC, "captured": CAPTURED}
 """By the names the command line knows."""

@@ -9,7 +9,17 @@ import pytest
 
 from dataset import Intrinsics
 from s2p3 import objects
-from s2p3.synthesis import CAPTURED, DOMAINS, SYNTHETIC, Analytic, Domain, Recipe, SceneParameters, render
+from s2p3.synthesis import (
+    CAPTURED,
+    DOMAINS,
+    PLAIN,
+    SYNTHETIC,
+    Analytic,
+    Domain,
+    Recipe,
+    SceneParameters,
+    render,
+)
 
 TINY = Intrinsics(np.array([[60.0, 0, 39.0], [0, 60.0, 31.5], [0, 0, 1]]), np.zeros(0), 64, 80)
 CUP = objects.build("cup")
@@ -35,6 +45,13 @@ def test_the_captured_domain_lies_beside_the_synthetic_one() -> None:
     assert 0.08 < np.mean(np.array(visible) < 0.98) < 0.21  # 13 to 16 % in the long run
 
 
+def test_the_plain_domain_shows_the_object_alone_and_as_the_model_says() -> None:
+    plain, visible = _drawn(PLAIN, 40)
+    assert min(visible) > 0.98
+    assert {scene.surface.refractive_index for scene in plain} == {CUP.refractive_index}
+    assert all(scene.dolp_scale == 1 and not scene.haze_dolp.any() for scene in plain)
+
+
 def test_matte_tables_do_not_polarize() -> None:
     domain = replace(SYNTHETIC, matte_table_share=1.0, clutter=(0, 0), occluder_share=0.0)
     drawn = Recipe(CUP, TINY, domain, Analytic(), 1).draw(0)
@@ -56,4 +73,4 @@ def test_a_given_material_is_kept_near() -> None:
 
 
 def test_domains_have_names() -> None:
-    assert DOMAINS == {"synthetic": SYNTHETIC, "captured": CAPTURED}
+    assert DOMAINS == {"plain": PLAIN, "synthetic": SYNTHETIC, "captured": CAPTURED}

@@ -19,9 +19,11 @@ from s2p3.inputs import NetworkInput, View
 from s2p3.networks.pose_head import decode_pose
 from s2p3.networks.teacher import MAP_STRIDE, Teacher, TeacherOutput
 from s2p3.objects import ObjectModel
-from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
+from s2p3.rendering.differentiable import RenderMesh, render
 from s2p3.training.batches import form_input, turn_maps, turn_vectors, view_window
+from s2p3.training.captured_losses import pooled_maps
 from s2p3.training.crops import Crops
+from s2p3.training.refinement import refine
 
 _CHUNK = 32
 
@@ -63,16 +65,25 @@ def labels_of(output: TeacherOutput, seen: NetworkInput, mesh: RenderMesh, diame
 
 @torch.no_grad()
 def make_labels(
-    teacher: Teacher, crops: Crops, model: ObjectModel, mesh: RenderMesh, config: ExperimentConfig
+    teacher: Teacher,
+    crops: Crops,
+    model: ObjectModel,
+    mesh: RenderMesh,
+    config: ExperimentConfig,
+    settings: SelfSupervisionConfig | None = None,
 ) -> PseudoLabels:
-    """Runs the teacher over every crop at the nominal zoom."""
+    """Runs the teacher over every crop at the nominal zoom; refines what it says where `settings` ask for
+    it."""
     teacher.eval()
     parts = []
     for start in range(0, len(crops), _CHUNK):
         indices = torch.arange(start, min(start + _CHUNK, len(crops)))
         view = View.centred(len(indices), config.input.zoom)
         seen = form_input(crops, indices, view, model.refractive_index, config)
-        parts.append(labels_of(teacher(seen.polarization, seen.priors), seen, mesh, model.diameter))
+        said = labels_of(teacher(seen.polarization, seen.priors), seen, mesh, model.diameter)
+        if settings is not None and settings.refine_steps:
+            said = refine(said, seen, mesh, model, settings)
+        parts.append(said)
     names = vars(parts[0])
     return PseudoLabels(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
@@ -105,9 +116,3 @@ def carry_labels(
         *pooled_maps(render(mesh, rotation, translation, K, size, size, silhouette=False)),
         labels.delta[indices],
     )
-
-
-def pooled_maps(rendered: RenderOutput) -> tuple[Tensor, Tensor]:
-    """Mask and unit normals of a rendering, at the resolution of the teacher's maps."""
-    normals = F.avg_pool2d(rendered.normals, MAP_STRIDE)
-    return F.avg_pool2d(rendered.mask, MAP_STRIDE), F.normalize(normals, dim=1)

@@ -29,20 +29,14 @@ from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
 from s2p3.training.adaptation import freeze_norms
+from s2p3.training.captured_losses import clouds, enlarged, pooled_maps, visible_surface
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
 from s2p3.training.loop import Forward, Losses, optimize
 from s2p3.training.pretrain import model_tensors
 from s2p3.training.progress import OnStep
-from s2p3.training.pseudo_labels import make_labels, pooled_maps
-from s2p3.training.self_supervised import (
-    CapturedBatch,
-    CapturedData,
-    clouds,
-    enlarged,
-    load_pair,
-    visible_surface,
-)
+from s2p3.training.pseudo_labels import make_labels
+from s2p3.training.self_supervised import CapturedBatch, CapturedData, load_pair
 
 
 def self_supervise_rgbd(

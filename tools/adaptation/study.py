@@ -3,10 +3,11 @@
     python tools/adaptation/study.py --object cup --out out/study    goes on where it was stopped
     python tools/adaptation/study.py --object cup --out out/study --split val    for tuning; publishes nothing
 
-Detector, teacher and student are trained on path-traced and analytic sets of the domain `synthetic`. The
-"captured" frames are of the domain `captured` (another index, light and background, noise, blur, occluders);
-their poses serve the evaluation only. OBJECT.toml beside this file holds what was tuned on their split `val`.
-Results go to docs/adaptation/OBJECT.json, of which page.py makes docs/adaptation.md.
+Detector, teacher and student are trained on path-traced and analytic sets of the domain `plain` (or, with
+--domain synthetic, of the varied one). The "captured" frames are of the domain `captured` (another index,
+light and background, noise, blur, occluders); their poses serve the evaluation only. OBJECT.toml beside this
+file holds what was tuned on their split `val`. Results go to docs/adaptation/OBJECT-DOMAIN.json, of which
+page.py makes docs/adaptation.md.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from s2p3.config import ExperimentConfig, SelfSupervisionConfig, load
 from s2p3.evaluation import Evaluation, evaluate, find_objects
 from s2p3.networks.detector import Detection
 from s2p3.provenance import checked_out_commit
-from s2p3.synthesis import CAPTURED, SYNTHETIC, Analytic, Domain, PathTraced, session_camera, synthesize
+from s2p3.synthesis import CAPTURED, DOMAINS, Analytic, Domain, PathTraced, session_camera, synthesize
 from s2p3.synthesis.scene import Backend
 from s2p3.training import captured_crops, self_supervise, train_detector, train_student, train_teacher
 from s2p3.training.adaptation import adapt_batch_norm
@@ -72,6 +73,7 @@ class Study:
         name: of the object.
         out: folder of everything the study makes.
         seeds: each trains teacher, student and every row anew; the sets and the detector are common.
+        domain: name of the one that the training sets are drawn from.
         traced, analytic: synthetic frames to train on, by backend.
         split: of the captured frames, that is evaluated.
     """
@@ -79,6 +81,7 @@ class Study:
     name: str
     out: Path
     seeds: tuple[int, ...]
+    domain: str
     traced: int
     analytic: int
     split: str
@@ -127,6 +130,7 @@ class Study:
 
 def make_sets(study: Study, workers: int) -> None:
     """Renders the sets that are missing, and divides the captured frames."""
+    trained_on = DOMAINS[study.domain]
     makers: list[tuple[Path, int, int, Domain, Backend]] = [
         (study.captured, CAPTURED_FRAMES, CAPTURED_SEED, CAPTURED, Analytic())
     ]
@@ -136,8 +140,8 @@ def make_sets(study: Study, workers: int) -> None:
     if study.traced:
         backends["traced"] = (PathTraced.here(), study.traced, TRACED_SEED, TRACED_HELD_OUT)
     for name, (backend, count, seed, held_out) in backends.items():
-        makers.append((study.out / f"{name}.h5", count, seed, SYNTHETIC, backend))
-        makers.append((study.out / f"{name}-held-out.h5", held_out, HELD_OUT_SEED, SYNTHETIC, backend))
+        makers.append((study.out / f"{name}.h5", count, seed, trained_on, backend))
+        makers.append((study.out / f"{name}-held-out.h5", held_out, HELD_OUT_SEED, trained_on, backend))
     model = objects.build(study.name)
     for path, count, seed, domain, backend in makers:
         if not path.exists():
@@ -320,6 +324,7 @@ def main() -> int:
     parser.add_argument("--object", choices=objects.NAMES, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--domain", choices=("plain", "synthetic"), default="plain", help="trained on")
     parser.add_argument("--traced", type=int, default=400, help="path-traced frames to train on")
     parser.add_argument("--analytic", type=int, default=1800, help="analytic frames to train on")
     parser.add_argument(
@@ -328,13 +333,19 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     study = Study(
-        options.object, options.out, tuple(options.seeds), options.traced, options.analytic, options.split
+        options.object,
+        options.out,
+        tuple(options.seeds),
+        options.domain,
+        options.traced,
+        options.analytic,
+        options.split,
     )
     run_study(study, options.workers)
     result = result_of(study)
     print(table(result))
     if options.split == "test":
-        publish(study.name, result)
+        publish(f"{study.name}-{study.domain}", result)
     return 0
 
 

@@ -65,9 +65,9 @@ def self_supervise_rgbd(
     settings = settings or pair.config.self6d
     perceptual = Perceptual.load(Path(settings.lpips_weights)) if settings.lpips_weights else None
     mesh = RenderMesh.from_mesh(model.mesh)
-    labels = make_labels(pair.teacher, crops, model, mesh, pair.config)
+    labels, looked = make_labels(pair.teacher, crops, model, mesh, pair.config)
     freeze_norms(pair.student)
-    data = CapturedData(crops, labels, mesh, model.refractive_index, pair.config)
+    data = CapturedData(crops, labels, looked, mesh, model.refractive_index, pair.config)
     objective = _Objective(mesh, *model_tensors(model), model.diameter, perceptual, settings)
     path, hashes = out / "adapted.safetensors", {"crops": crops_hash(crops)}
     trained = optimize(

@@ -73,7 +73,7 @@ def self_supervise(
         if settings.adapt_teacher:
             adapt_batch_norm(pair.teacher, crops, model.refractive_index, pair.config, settings)
     mesh = RenderMesh.from_mesh(model.mesh)
-    labels = make_labels(pair.teacher, crops, model, mesh, pair.config, settings)
+    labels, looked = make_labels(pair.teacher, crops, model, mesh, pair.config, settings)
     path = out / "adapted.safetensors"
     report_signal(captured_signal(crops, labels.rotation, labels.translation, model), path)
     if settings.freeze_norms:
@@ -81,7 +81,7 @@ def self_supervise(
     set_momentum(pair.student, _BATCH_NORM_MOMENTUM)
     if settings.teacher == "ema":
         network = _following(pair, student, settings)
-    data = CapturedData(crops, labels, mesh, model.refractive_index, pair.config)
+    data = CapturedData(crops, labels, looked, mesh, model.refractive_index, pair.config)
     objective = _Objective(
         mesh,
         *model_tensors(model),
@@ -144,6 +144,7 @@ class CapturedData:
 
     crops: Crops
     labels: PseudoLabels
+    looked: View
     mesh: RenderMesh
     refractive_index: float
     config: ExperimentConfig
@@ -155,7 +156,8 @@ class CapturedData:
     def __call__(self, rows: Tensor, generator: torch.Generator) -> CapturedBatch:
         view = View.random(len(rows), self.config.augmentation, generator)
         seen = form_input(self.crops, rows, view, self.refractive_index, self.config, generator)
-        return CapturedBatch(seen, carry_labels(self.labels, self.crops, rows, view, self.mesh, self.config))
+        labels = self.labels, self.looked
+        return CapturedBatch(seen, carry_labels(*labels, self.crops, rows, view, self.mesh, self.config))
 
 
 @dataclass(frozen=True)

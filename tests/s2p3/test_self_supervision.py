@@ -230,7 +230,7 @@ def test_labels_made_over_all_crops_are_those_of_each_batch(cup_session: Path, c
     config, mesh = tiny(), RenderMesh.from_mesh(cup.mesh)
     crops = labelled_crops([cup_session], cup, config.input, on_step=silent)
     teacher = build_teacher(config).eval()
-    labels = make_labels(teacher, crops, cup, mesh, config)
+    labels, _ = make_labels(teacher, crops, cup, mesh, config)
     assert labels.rotation.shape == (8, 3, 3)
     agreed = SelfSupervisionConfig(threshold=0.25)
     assert labels.threshold(agreed) == 0.25

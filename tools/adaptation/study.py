@@ -49,16 +49,34 @@ TRACED_SEED, ANALYTIC_SEED, HELD_OUT_SEED, CAPTURED_SEED = 0, 1, 2, 100
 
 Change = Callable[[SelfSupervisionConfig], SelfSupervisionConfig]
 
+ADABN = SelfSupervisionConfig().adapt_batches
+LABELS_AS_GIVEN = 0
+"""Steps of refinement: none."""
+
 TRAINED: dict[str, Change] = {
-    "student, AdaBN alone": lambda settings: replace(settings, steps=0, epochs=0),
-    "student, pose-only distillation": lambda settings: replace(
-        settings, pose_weight=1.0, mask_weight=0.0, normals_weight=0.0, physics="none"
+    "student, AdaBN alone": lambda settings: replace(
+        settings, steps=0, epochs=0, adapt_batches=ADABN, refine_steps=LABELS_AS_GIVEN
     ),
-    "student, without physics": lambda settings: replace(settings, physics="none"),
-    "student, DoLP physics (the paper's)": lambda settings: replace(settings, physics="dolp"),
-    "student, Stokes physics (ours)": lambda settings: replace(settings, physics="stokes"),
+    "student, pose-only distillation": lambda settings: replace(
+        settings,
+        pose_weight=1.0,
+        mask_weight=0.0,
+        normals_weight=0.0,
+        physics="none",
+        refine_steps=LABELS_AS_GIVEN,
+    ),
+    "student, DoLP physics (the paper's)": lambda settings: replace(
+        settings, physics="dolp", refine_steps=LABELS_AS_GIVEN
+    ),
+    "student, Stokes physics (ours)": lambda settings: replace(
+        settings, physics="stokes", refine_steps=LABELS_AS_GIVEN
+    ),
+    "student, refined labels, without physics": lambda settings: replace(settings, physics="none"),
+    "student, refined labels, DoLP physics": lambda settings: replace(settings, physics="dolp"),
+    "student, refined labels, Stokes physics": lambda settings: replace(settings, physics="stokes"),
 }
-"""The rows that start from the pre-trained student, and how each departs from the object's settings."""
+"""The rows that start from the pre-trained student, and how each departs from the object's settings, which
+refine the labels."""
 
 BEFORE, TEACHER, ADAPTED_TEACHER = "student before", "teacher", "teacher, AdaBN alone"
 ROWS = (BEFORE, TEACHER, ADAPTED_TEACHER, *TRAINED)
@@ -198,7 +216,8 @@ def adapt_network(study: Study, row: str, seed: int) -> None:
     path = study.checkpoint(row, seed)
     if row == ADAPTED_TEACHER:
         network, info = load_teacher(teacher, model.name)
-        adapt_batch_norm(network, crops, model.refractive_index, config, config.self_supervision)
+        settings = replace(config.self_supervision, adapt_batches=ADABN)
+        adapt_batch_norm(network, crops, model.refractive_index, config, settings)
         path.parent.mkdir(parents=True, exist_ok=True)
         save(path, network.state_dict(), CheckpointInfo.of("teacher", "AdaBN", model, 0, config, info.data))
     else:

@@ -3,11 +3,12 @@
     python tools/adaptation/study.py --object cup --out out/study    goes on where it was stopped
     python tools/adaptation/study.py --object cup --out out/study --split val    for tuning; publishes nothing
 
-Detector, teacher and student are trained on path-traced and analytic sets of the domain `plain` (or, with
---domain synthetic, of the varied one). The "captured" frames are of the domain `captured` (another index,
-light and background, noise, blur, occluders); their poses serve the evaluation only. OBJECT.toml beside this
-file holds what was tuned on their split `val`. Results go to docs/adaptation/OBJECT-DOMAIN.json, of which
-page.py makes docs/adaptation.md.
+Teacher and student are trained on path-traced and analytic sets of the domain `plain` (or, with --domain
+synthetic, of the varied one); the detector, whose boxes all share, on analytic images of the varied one. The
+"captured" frames are of the domain `captured` (other things on the table, another index, light, background,
+noise, blur, occluders); their poses serve the evaluation only. OBJECT.toml beside this file holds what
+was tuned on their split `val`. Results go to docs/adaptation/OBJECT-DOMAIN.json, of which page.py makes
+docs/adaptation.md.
 """
 
 from __future__ import annotations
@@ -35,17 +36,26 @@ from s2p3.config import ExperimentConfig, SelfSupervisionConfig, load
 from s2p3.evaluation import Evaluation, evaluate, find_objects
 from s2p3.networks.detector import Detection
 from s2p3.provenance import checked_out_commit
-from s2p3.synthesis import CAPTURED, DOMAINS, Analytic, Domain, PathTraced, session_camera, synthesize
+from s2p3.synthesis import (
+    CAPTURED,
+    DOMAINS,
+    SYNTHETIC,
+    Analytic,
+    Domain,
+    PathTraced,
+    session_camera,
+    synthesize,
+)
 from s2p3.synthesis.scene import Backend
 from s2p3.training import captured_crops, self_supervise, train_detector, train_student, train_teacher
 from s2p3.training.adaptation import adapt_batch_norm
 from s2p3.training.checkpoint import CheckpointInfo, save
 from s2p3.training.pretrain import load_teacher
 
-CAPTURED_FRAMES = 1600
-SHARES = {"train": 0.25, "val": 0.125}  # the rest, a thousand frames, is the test
+CAPTURED_FRAMES, DETECTOR_FRAMES = 3200, 1800
+SHARES = {"train": 0.6, "val": 0.0875}  # the rest, a thousand frames, is the test
 TRACED_HELD_OUT, ANALYTIC_HELD_OUT = 60, 300  # frames
-TRACED_SEED, ANALYTIC_SEED, HELD_OUT_SEED, CAPTURED_SEED = 0, 1, 2, 100
+TRACED_SEED, ANALYTIC_SEED, HELD_OUT_SEED, DETECTOR_SEED, CAPTURED_SEED = 0, 1, 2, 3, 100
 
 Change = Callable[[SelfSupervisionConfig], SelfSupervisionConfig]
 
@@ -113,6 +123,10 @@ class Study:
         return self.out / "captured.h5"
 
     @property
+    def detector_set(self) -> Path:
+        return self.out / "detector.h5"
+
+    @property
     def detector(self) -> Path:
         return self.out / "detector" / "detector.safetensors"
 
@@ -150,7 +164,8 @@ def make_sets(study: Study, workers: int) -> None:
     """Renders the sets that are missing, and divides the captured frames."""
     trained_on = DOMAINS[study.domain]
     makers: list[tuple[Path, int, int, Domain, Backend]] = [
-        (study.captured, CAPTURED_FRAMES, CAPTURED_SEED, CAPTURED, Analytic())
+        (study.captured, CAPTURED_FRAMES, CAPTURED_SEED, CAPTURED, Analytic()),
+        (study.detector_set, DETECTOR_FRAMES, DETECTOR_SEED, SYNTHETIC, Analytic()),
     ]
     backends: dict[str, tuple[Backend, int, int, int]] = {}
     if study.analytic:
@@ -176,7 +191,7 @@ def train_network(study: Study, what: str, seed: int) -> None:
     config, model, cache = study.experiment(seed), objects.build(study.name), study.out / "crops"
     if what == "detector":
         if not study.detector.exists():
-            train_detector(study.training_sets(), model, config, study.detector.parent, _silent)
+            train_detector([study.detector_set], model, config, study.detector.parent, _silent)
         find_captured(study)
     elif what == TEACHER:
         out = study.checkpoint(TEACHER, seed).parent

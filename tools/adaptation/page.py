@@ -15,14 +15,17 @@ PAGE = ROOT / "docs" / "adaptation.md"
 HEAD = """# Does self-supervision help?
 
 Every table on this page was made by the command above it, at the commit beside it. Teacher and student are
-trained on path-traced and analytic images of the [domain](synthesis.md#domains) `synthetic`; the frames
-they must cope with are of the domain `captured`: dark, noisy and blurred, under many hard lamps, with another
-refractive index, leaking polarizers, mirroring and polarized backgrounds, and things in front of the object.
-How hard that domain is is our choice: hard enough for the pre-trained networks to fail on every second frame,
-before any of them was adapted to it. It stands in for a recorded sequence, and has one advantage over it:
-exact truth. Losses and images share one Fresnel model, so real surfaces will be harder. Settings were tuned
-on the captured split `val`; the split `test` is looked at here only. Boxes and masks are the detector's, and
-a target without a detection counts as failed.
+trained on path-traced and analytic images of the [domain](synthesis.md#domains) that the section names; the
+frames they must cope with are of the domain `captured`. It stands in for a recorded sequence, and has one
+advantage over it: exact truth. How far it lies from the other domains is our choice. Losses and images share
+one Fresnel model, so real surfaces will be harder. Settings were tuned on the captured split `val`; the split
+`test` is looked at here only. Boxes and masks are those of one detector, trained on the domain `synthetic`,
+and a target without a detection counts as failed.
+
+The rows: networks *before*; with BatchNorm statistics re-estimated on captured frames (*AdaBN*); a student
+that only copies the poses of the teacher (*pose-only distillation*); the paper's method, with its physics or
+with ours; and the same with [refined labels](method.md#refined-labels), our extension: the teacher's poses
+are fitted to its own maps before the student learns from them.
 """
 CONTROLS = (
     "student before",
@@ -72,11 +75,16 @@ def write_page() -> None:
     for path in sorted(RESULTS.glob("*.json")):
         kept = json.loads(path.read_text(encoding="utf-8"))
         parts += [
-            f"## {path.stem.capitalize()}\n",
+            f"## {_title(path.stem)}\n",
             f"`{kept['command']}` at commit `{kept['commit']}`, {kept['date']}\n",
             table(kept["result"]),
         ]
     PAGE.write_text("\n".join(parts), encoding="utf-8")
+
+
+def _title(stem: str) -> str:
+    name, domain = stem.split("-")
+    return f"{name.capitalize()}, trained on `{domain}`"
 
 
 def _row(name: str, figures: list[dict[str, Any]]) -> str:

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from datetime import date
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -293,9 +294,14 @@ def run_study(study: Study, workers: int) -> None:
 def minutes_of(study: Study) -> dict[str, float]:
     """What the trainings took, on average, a process and a thread each: from their logs."""
 
+    def seconds(log: Path) -> float:
+        """Of all sessions of a training: each counts from zero."""
+        times = [0.0, *(json.loads(line)["seconds"] for line in log.read_text(encoding="utf-8").splitlines())]
+        return sum(now - before if now > before else now for before, now in pairwise(times))
+
     def spent(checkpoints: Iterable[Path]) -> float:
-        logs = [path.with_suffix(".log.jsonl").read_text(encoding="utf-8") for path in checkpoints]
-        return round(float(np.mean([json.loads(log.splitlines()[-1])["seconds"] for log in logs])) / 60, 1)
+        logs = [path.with_suffix(".log.jsonl") for path in checkpoints]
+        return round(float(np.mean([seconds(log) for log in logs])) / 60, 1)
 
     trained = [row for row in TRAINED if row != "student, AdaBN alone"]
     return {

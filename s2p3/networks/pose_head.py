@@ -17,7 +17,6 @@ from torch import Tensor, nn
 OUTPUTS = 9
 NOMINAL_ZOOM = 1.4  # our choice: makes the typical relative depth about one
 _DEPTH_RANGE_M = (0.02, 20.0)
-_ORIGIN = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)  # what an output of zeros means
 
 
 class PoseHead(nn.Module):
@@ -114,18 +113,10 @@ def decode_pose(output: Tensor, K: Tensor, size: int, diameter_m: float) -> tupl
         size: side of the crops, pixels.
         diameter_m: of the object.
     """
-    pose = output + output.new_tensor(_ORIGIN)
-    translation = translation_from_site(pose[:, 6:], K, size, diameter_m)
-    allocentric = rotation_from_6d(pose[:, :6])
+    site = output[:, 6:9] + output.new_tensor([0.0, 0.0, 1.0])
+    translation = translation_from_site(site, K, size, diameter_m)
+    allocentric = rotation_from_6d(output[:, :6] + output.new_tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0]))
     return ray_rotation(translation) @ allocentric, translation, allocentric
-
-
-def encode_pose(rotation: Tensor, translation: Tensor, K: Tensor, size: int, diameter_m: float) -> Tensor:
-    """(B, 9), the output that `decode_pose` makes this pose of: its inverse, with the same arguments."""
-    allocentric = ray_rotation(translation).transpose(1, 2) @ rotation
-    site = site_from_translation(translation, K, size, diameter_m)
-    pose = torch.cat([allocentric[:, :, 0], allocentric[:, :, 1], site], dim=1)
-    return pose - pose.new_tensor(_ORIGIN)
 
 
 def _unit_depth(K: Tensor, size: int, diameter_m: float) -> Tensor:

@@ -29,14 +29,20 @@ from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
 from s2p3.training.adaptation import freeze_norms
-from s2p3.training.captured_losses import clouds, enlarged, pooled_maps, visible_surface
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
 from s2p3.training.loop import Forward, Losses, optimize
 from s2p3.training.pretrain import model_tensors
 from s2p3.training.progress import OnStep
-from s2p3.training.pseudo_labels import make_labels
-from s2p3.training.self_supervised import CapturedBatch, CapturedData, load_pair
+from s2p3.training.pseudo_labels import make_labels, pooled_maps
+from s2p3.training.self_supervised import (
+    CapturedBatch,
+    CapturedData,
+    clouds,
+    enlarged,
+    load_pair,
+    visible_surface,
+)
 
 
 def self_supervise_rgbd(
@@ -65,9 +71,9 @@ def self_supervise_rgbd(
     settings = settings or pair.config.self6d
     perceptual = Perceptual.load(Path(settings.lpips_weights)) if settings.lpips_weights else None
     mesh = RenderMesh.from_mesh(model.mesh)
-    labels, looked = make_labels(pair.teacher, crops, model, mesh, pair.config)
+    labels = make_labels(pair.teacher, crops, model, mesh, pair.config)
     freeze_norms(pair.student)
-    data = CapturedData(crops, labels, looked, mesh, model.refractive_index, pair.config)
+    data = CapturedData(crops, labels, mesh, model.refractive_index, pair.config)
     objective = _Objective(mesh, *model_tensors(model), model.diameter, perceptual, settings)
     path, hashes = out / "adapted.safetensors", {"crops": crops_hash(crops)}
     trained = optimize(

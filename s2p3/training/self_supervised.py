@@ -11,21 +11,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dataset.errors import ToolkitError
-from s2p3 import losses
+from s2p3 import losses, physics
 from s2p3.config import ExperimentConfig, SelfSupervisionConfig
 from s2p3.inputs import NetworkInput, View
 from s2p3.networks.pose_head import decode_pose
 from s2p3.networks.student import Student
-from s2p3.networks.teacher import Teacher, TeacherOutput, pose_of
+from s2p3.networks.teacher import MAP_STRIDE, Teacher, TeacherOutput, pose_of
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
 from s2p3.training.adaptation import adapt_batch_norm, freeze_norms, set_momentum
 from s2p3.training.batches import form_input
-from s2p3.training.captured_losses import clouds, enlarged, physics_error, pooled_maps, visible_surface
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
 from s2p3.training.loop import Forward, Losses, optimize
@@ -33,7 +33,7 @@ from s2p3.training.mean_teacher import MeanTeacher
 from s2p3.training.physics_signal import captured_signal, report_signal
 from s2p3.training.pretrain import load_student, load_teacher, model_tensors
 from s2p3.training.progress import OnStep
-from s2p3.training.pseudo_labels import PseudoLabels, carry_labels, labels_of, make_labels
+from s2p3.training.pseudo_labels import PseudoLabels, carry_labels, labels_of, make_labels, pooled_maps
 
 _BATCH_NORM_MOMENTUM = 0.02
 
@@ -73,7 +73,7 @@ def self_supervise(
         if settings.adapt_teacher:
             adapt_batch_norm(pair.teacher, crops, model.refractive_index, pair.config, settings)
     mesh = RenderMesh.from_mesh(model.mesh)
-    labels, looked = make_labels(pair.teacher, crops, model, mesh, pair.config, settings)
+    labels = make_labels(pair.teacher, crops, model, mesh, pair.config)
     path = out / "adapted.safetensors"
     report_signal(captured_signal(crops, labels.rotation, labels.translation, model), path)
     if settings.freeze_norms:
@@ -81,7 +81,7 @@ def self_supervise(
     set_momentum(pair.student, _BATCH_NORM_MOMENTUM)
     if settings.teacher == "ema":
         network = _following(pair, student, settings)
-    data = CapturedData(crops, labels, looked, mesh, model.refractive_index, pair.config)
+    data = CapturedData(crops, labels, mesh, model.refractive_index, pair.config)
     objective = _Objective(
         mesh,
         *model_tensors(model),
@@ -144,7 +144,6 @@ class CapturedData:
 
     crops: Crops
     labels: PseudoLabels
-    looked: View
     mesh: RenderMesh
     refractive_index: float
     config: ExperimentConfig
@@ -156,8 +155,7 @@ class CapturedData:
     def __call__(self, rows: Tensor, generator: torch.Generator) -> CapturedBatch:
         view = View.random(len(rows), self.config.augmentation, generator)
         seen = form_input(self.crops, rows, view, self.refractive_index, self.config, generator)
-        labels = self.labels, self.looked
-        return CapturedBatch(seen, carry_labels(*labels, self.crops, rows, view, self.mesh, self.config))
+        return CapturedBatch(seen, carry_labels(self.labels, self.crops, rows, view, self.mesh, self.config))
 
 
 @dataclass(frozen=True)
@@ -186,8 +184,7 @@ class _Objective:
         mask_error, normals_error = self._geometry(output, rendered, target)
         terms = {"pose": weighted.mean(), "mask": mask_error, "normals": normals_error}
         if settings.physics != "none":
-            error = physics_error(seen, rendered, target.mask, self.refractive_index, settings)
-            terms["physics"] = error.mean()
+            terms["physics"] = self._physics(seen, rendered, target.mask).mean()
         if settings.depth != "none":
             surface = visible_surface(self.mesh, rotation, translation, seen)
             terms["depth"] = self._depth(seen, surface, target.mask).mean() / self.diameter_m
@@ -209,6 +206,23 @@ class _Objective:
         normals = [losses.normals_loss(n, true_normals, mask, true_mask).mean() for mask, n in maps]
         return torch.stack(masks).sum(), torch.stack(normals).sum()
 
+    def _physics(self, seen: NetworkInput, rendered: RenderOutput, predicted_mask: Tensor) -> Tensor:
+        """L_physics where the rendered and the teacher's predicted mask agree (our choice of pixels)."""
+        inside = (rendered.mask.detach() > 0.5) & (enlarged(predicted_mask) > 0.5)
+        stokes = seen.stokes
+        if self.settings.smoothing > 1:
+            side = self.settings.smoothing
+            stokes = F.avg_pool2d(stokes, side, 1, side // 2, count_include_pad=False)
+        rays = physics.pixel_rays(seen.K, seen.size, seen.size)
+        return losses.physics_loss(
+            self.settings.physics,
+            stokes,
+            rendered.normals_interior,
+            rays,
+            inside.float(),
+            self.refractive_index,
+        )
+
     def _depth(self, seen: NetworkInput, surface: RenderOutput, predicted_mask: Tensor) -> Tensor:
         """The losses of the paper's depth ablation, metres, on what is measured in the predicted mask."""
         assert seen.depth is not None
@@ -216,6 +230,26 @@ class _Objective:
         if self.settings.depth == "pixel":
             return losses.depth_loss(surface.depth, seen.depth, inside)
         return losses.chamfer_loss(*clouds(seen, surface, inside))
+
+
+def enlarged(maps: Tensor) -> Tensor:
+    """A teacher's maps at the resolution of its input."""
+    return F.interpolate(maps, scale_factor=float(MAP_STRIDE), mode="bilinear")
+
+
+def visible_surface(
+    mesh: RenderMesh, rotation: Tensor, translation: Tensor, seen: NetworkInput
+) -> RenderOutput:
+    """The object at the student's pose, for losses per visible pixel: a depth has no outline to move."""
+    return render(mesh, rotation, translation, seen.K, seen.size, seen.size, silhouette=False)
+
+
+def clouds(seen: NetworkInput, surface: RenderOutput, inside: Tensor) -> tuple[Tensor, Tensor]:
+    """Measured points inside a mask, and points of the visible surface, each (B, n, 3)."""
+    assert seen.depth is not None
+    measured = losses.back_project(seen.depth, inside, seen.K, losses.CLOUD_POINTS)
+    drawn = losses.back_project(surface.depth, surface.mask, seen.K, losses.CLOUD_POINTS)
+    return measured, drawn
 
 
 def _following(pair: Pair, path: Path, settings: SelfSupervisionConfig) -> MeanTeacher:

@@ -27,16 +27,15 @@ from s2p3.networks.detector import Detection
 from s2p3.networks.teacher import Teacher, TeacherOutput
 from s2p3.objects import ObjectModel
 from s2p3.rendering import rasterize
-from s2p3.rendering.differentiable import RenderMesh, render
+from s2p3.rendering.differentiable import RenderMesh
 from s2p3.synthesis.informativeness import Informativeness
 from s2p3.training import Crops, captured_crops, checkpoint, labelled_crops, self_supervise
-from s2p3.training.batches import form_input, turn_vectors, view_window
-from s2p3.training.captured_losses import clouds, pooled_maps, visible_surface
+from s2p3.training.batches import form_input
 from s2p3.training.mean_teacher import MeanTeacher
 from s2p3.training.physics_signal import captured_signal, labelled_signal, objection, report_signal
-from s2p3.training.pseudo_labels import PseudoLabels, labels_of, make_labels
-from s2p3.training.refinement import refine
+from s2p3.training.pseudo_labels import labels_of, make_labels
 from s2p3.training.self6d import self_supervise_rgbd
+from s2p3.training.self_supervised import clouds, visible_surface
 from tests.s2p3.untrained import save_untrained
 
 pytestmark = pytest.mark.filterwarnings("ignore::dataset.errors.ToolkitWarning")
@@ -155,39 +154,6 @@ def test_a_depth_loss_without_depth_is_refused(
         run(cup_session, cup, direct, tmp_path, depth="chamfer")
 
 
-@pytest.mark.parametrize("physics", ["none", "stokes"])
-def test_refined_labels_explain_the_maps(
-    physics: Literal["none", "stokes"], cup_session: Path, cup: ObjectModel
-) -> None:
-    config, mesh, size = tiny(), RenderMesh.from_mesh(cup.mesh), 64
-    crops = labelled_crops([cup_session], cup, config.input, on_step=silent)
-    view, rows = View.centred(len(crops), config.input.zoom), torch.arange(len(crops))
-    seen = form_input(crops, rows, view, cup.refractive_index, config)
-    turn = view_window(crops, rows, view, config, size).rotation
-    true = turn @ crops.rotation, turn_vectors(turn, crops.translation)
-    wrong = rotation_about(torch.tensor([0.05, -0.1, 0.08])) @ true[0], 1.04 * true[1]
-    maps, drawn = (pooled_maps(render(mesh, *pose, seen.K, size, size)) for pose in (true, wrong))
-    labels = PseudoLabels(*wrong, *maps, *drawn, losses.discrepancy(maps[0], drawn[0]))
-    settings = dataclasses.replace(config.self_supervision, refine_steps=80, physics=physics)
-    refined = refine(labels, seen, mesh, cup, settings)
-    points = torch.from_numpy(cup.surface_points(200)).float()
-    goal = losses.transform(points, *true)
-    before, after = (
-        (losses.transform(points, pose.rotation, pose.translation) - goal).norm(dim=-1).mean(1)
-        for pose in (labels, refined)
-    )
-    assert after.median() < 0.2 * before.median()
-    assert refined.delta.median() < 0.3 * labels.delta.median()
-    assert torch.equal(refined.mask, labels.mask)
-
-
-def rotation_about(vector: torch.Tensor) -> torch.Tensor:
-    """(3, 3) of a rotation vector (3,)."""
-    x, y, z = vector
-    o = torch.zeros(())
-    return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o]).view(3, 3))
-
-
 def test_the_large_student_learns_by_what_it_predicts_too(
     cup_session: Path, cup: ObjectModel, large: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -230,7 +196,7 @@ def test_labels_made_over_all_crops_are_those_of_each_batch(cup_session: Path, c
     config, mesh = tiny(), RenderMesh.from_mesh(cup.mesh)
     crops = labelled_crops([cup_session], cup, config.input, on_step=silent)
     teacher = build_teacher(config).eval()
-    labels, _ = make_labels(teacher, crops, cup, mesh, config)
+    labels = make_labels(teacher, crops, cup, mesh, config)
     assert labels.rotation.shape == (8, 3, 3)
     agreed = SelfSupervisionConfig(threshold=0.25)
     assert labels.threshold(agreed) == 0.25

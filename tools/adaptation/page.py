@@ -23,9 +23,8 @@ one Fresnel model, so real surfaces will be harder. Settings were tuned on the c
 and a target without a detection counts as failed.
 
 The rows: networks *before*; with BatchNorm statistics re-estimated on captured frames (*AdaBN*); a student
-that only copies the poses of the teacher (*pose-only distillation*); the paper's method, with its physics or
-with ours; and the same with [refined labels](method.md#refined-labels), our extension: the teacher's poses
-are fitted to its own maps before the student learns from them.
+that only copies the poses of the teacher (*pose-only distillation*); one that learns from its maps, too
+(*without physics*); and the whole method, with the paper's physics or with ours.
 """
 CONTROLS = (
     "student before",

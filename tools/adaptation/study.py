@@ -61,33 +61,16 @@ TRACED_SEED, ANALYTIC_SEED, HELD_OUT_SEED, DETECTOR_SEED, CAPTURED_SEED = 0, 1, 
 Change = Callable[[SelfSupervisionConfig], SelfSupervisionConfig]
 
 ADABN = SelfSupervisionConfig().adapt_batches
-LABELS_AS_GIVEN = 0
-"""Steps of refinement: none."""
-
 TRAINED: dict[str, Change] = {
-    "student, AdaBN alone": lambda settings: replace(
-        settings, steps=0, epochs=0, adapt_batches=ADABN, refine_steps=LABELS_AS_GIVEN
-    ),
+    "student, AdaBN alone": lambda settings: replace(settings, steps=0, epochs=0, adapt_batches=ADABN),
     "student, pose-only distillation": lambda settings: replace(
-        settings,
-        pose_weight=1.0,
-        mask_weight=0.0,
-        normals_weight=0.0,
-        physics="none",
-        refine_steps=LABELS_AS_GIVEN,
+        settings, pose_weight=1.0, mask_weight=0.0, normals_weight=0.0, physics="none"
     ),
-    "student, DoLP physics (the paper's)": lambda settings: replace(
-        settings, physics="dolp", refine_steps=LABELS_AS_GIVEN
-    ),
-    "student, Stokes physics (ours)": lambda settings: replace(
-        settings, physics="stokes", refine_steps=LABELS_AS_GIVEN
-    ),
-    "student, refined labels, without physics": lambda settings: replace(settings, physics="none"),
-    "student, refined labels, DoLP physics": lambda settings: replace(settings, physics="dolp"),
-    "student, refined labels, Stokes physics": lambda settings: replace(settings, physics="stokes"),
+    "student, without physics": lambda settings: replace(settings, physics="none"),
+    "student, DoLP physics (the paper's)": lambda settings: replace(settings, physics="dolp"),
+    "student, Stokes physics (ours)": lambda settings: replace(settings, physics="stokes"),
 }
-"""The rows that start from the pre-trained student, and how each departs from the object's settings, which
-refine the labels."""
+"""The rows that start from the pre-trained student, and how each departs from the object's settings."""
 
 BEFORE, TEACHER, ADAPTED_TEACHER = "student before", "teacher", "teacher, AdaBN alone"
 ROWS = (BEFORE, TEACHER, ADAPTED_TEACHER, *TRAINED)

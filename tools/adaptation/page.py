@@ -32,6 +32,7 @@ CONTROLS = (
     "teacher",
     "teacher, AdaBN alone",
     "student, pose-only distillation",
+    "student, without physics",
 )
 """What the adapted students are compared with."""
 

@@ -43,7 +43,8 @@ class NetworkInput:
         priors: (B, D, S, S), what the second encoder sees: the normals n_d, n_s1, n_s2 of the physical model;
             of the baselines `depth_channels`, or the intensity again.
         K: (B, 3, 3) intrinsics of the crops, pixel centres at integers.
-        stokes: (B, 3, S, S) what the channels were made from, for L_physics.
+        stokes: (B, 3, S, S) as measured, for L_physics: turned and resampled, but not augmented otherwise.
+        valid: (B, 1, S, S) bool, where they are a measurement: neither saturated nor too dark.
         depth: (B, 1, S, S) metres, 0 unknown; None where there is none.
     """
 
@@ -51,6 +52,7 @@ class NetworkInput:
     priors: Tensor
     K: Tensor
     stokes: Tensor
+    valid: Tensor
     depth: Tensor | None = None
 
     @property
@@ -309,4 +311,5 @@ def network_input(
         second = depth_channels(depth * shown, K)
     last = torch.channels_last
     first, second = (image.contiguous(memory_format=last) for image in (first, second))
-    return NetworkInput(first, second, K, stokes, depth)
+    everywhere = torch.ones_like(stokes[:, :1], dtype=torch.bool)
+    return NetworkInput(first, second, K, stokes, everywhere, depth)

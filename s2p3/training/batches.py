@@ -3,7 +3,7 @@ along."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -14,6 +14,8 @@ from s2p3.config import ExperimentConfig
 from s2p3.inputs import NetworkInput, View, Window
 from s2p3.networks.teacher import MAP_STRIDE
 from s2p3.training.crops import Crops, LabelledCrops
+
+_WHOLLY = 0.999  # of a resampled flag: every pixel under it had it
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ def form_input(
     """
     window = view_window(crops, indices, view, config, config.input.size)
     stokes = inputs.rotate_stokes(window.resample(crops.stokes[indices].float()), view.angle)
-    stokes = inputs.normalize_exposure(stokes)
+    stokes = measured = inputs.normalize_exposure(stokes)
     if augment is not None:
         stokes = inputs.augment_photometry(stokes, config.augmentation, augment)
     mask = None
@@ -67,7 +69,11 @@ def form_input(
     depth = None
     if crops.depth is not None:
         depth = window.resample(crops.depth[indices].float(), mode="nearest", padding="zeros")
-    return inputs.network_input(stokes, window.K, refractive_index, config.input, mask, depth)
+    seen = inputs.network_input(stokes, window.K, refractive_index, config.input, mask, depth)
+    valid = seen.valid
+    if crops.valid is not None:
+        valid = window.resample(crops.valid[indices].float()) > _WHOLLY
+    return replace(seen, stokes=measured, valid=valid)
 
 
 def form_targets(crops: LabelledCrops, indices: Tensor, view: View, config: ExperimentConfig) -> Targets:

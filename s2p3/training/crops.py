@@ -47,6 +47,8 @@ class Crops:
         K: (N, 3, 3) float32, intrinsics of the crops.
         frames: (N,) int64, frame index in the session (or position in the list of sessions' frames).
         depth: (N, 1, P, P) float16 metres, 0 unknown; None where the sessions have none.
+        valid: (N, 1, P, P) bool, where `stokes` is a measurement: neither saturated nor too dark; None where
+            nobody asks.
     """
 
     stokes: Tensor
@@ -54,6 +56,7 @@ class Crops:
     K: Tensor
     frames: Tensor
     depth: Tensor | None = None
+    valid: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.stokes)
@@ -221,19 +224,16 @@ def captured_crops(
 
     Raises ToolkitError: the object was detected in no frame; networks that see depth, and there is none.
     """
-    rows = [
-        _crop(
-            np.moveaxis(session.stokes(index).stack(), 0, -1),
-            found.mask,
-            found.box_xywh,
-            session.working_intrinsics,
-            config,
-            index,
-            depth_of(session, index, config),
-        )
-        for index, found in zip(indices, detections, strict=True)
-        if found is not None
-    ]
+    rows = []
+    for index, found in zip(indices, detections, strict=True):
+        if found is None:
+            continue
+        stokes, depth = session.stokes(index), depth_of(session, index, config)
+        image, camera = np.moveaxis(stokes.stack(), 0, -1), session.working_intrinsics
+        row = _crop(image, found.mask, found.box_xywh, camera, config, index, depth)
+        region = square_box(found.box_xywh, config.canonical_zoom)
+        whole = extract_crop(stokes.valid[None].astype(np.float32), region, config.canonical_size)
+        rows.append({**row, "valid": whole > 0.999})
     if not rows:
         raise ToolkitError(
             "the detector found the object in none of the frames given; "

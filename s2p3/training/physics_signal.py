@@ -95,6 +95,8 @@ def _seen(crops: Crops, normals: Tensor | None = None, drawn: Tensor | None = No
     inside = (crops.mask > _INSIDE) & (normals.norm(dim=1, keepdim=True) > _INSIDE)
     if drawn is not None:
         inside = inside & (drawn > _INSIDE)
+    if crops.valid is not None:
+        inside = inside & crops.valid
     for index in range(len(crops)):
         yield (
             crops.stokes[index].float().numpy(),

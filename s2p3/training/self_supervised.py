@@ -207,12 +207,10 @@ class _Objective:
         return torch.stack(masks).sum(), torch.stack(normals).sum()
 
     def _physics(self, seen: NetworkInput, rendered: RenderOutput, predicted_mask: Tensor) -> Tensor:
-        """L_physics where the rendered and the teacher's predicted mask agree (our choice of pixels)."""
-        inside = (rendered.mask.detach() > 0.5) & (enlarged(predicted_mask) > 0.5)
-        stokes = seen.stokes
-        if self.settings.smoothing > 1:
-            side = self.settings.smoothing
-            stokes = F.avg_pool2d(stokes, side, 1, side // 2, count_include_pad=False)
+        """L_physics where the rendered and the teacher's predicted mask agree and there is a measurement (our
+        choice of pixels)."""
+        inside = (rendered.mask.detach() > 0.5) & (enlarged(predicted_mask) > 0.5) & seen.valid
+        stokes = smoothed(seen.stokes, seen.valid, self.settings.smoothing)
         rays = physics.pixel_rays(seen.K, seen.size, seen.size)
         return losses.physics_loss(
             self.settings.physics,
@@ -235,6 +233,15 @@ class _Objective:
 def enlarged(maps: Tensor) -> Tensor:
     """A teacher's maps at the resolution of its input."""
     return F.interpolate(maps, scale_factor=float(MAP_STRIDE), mode="bilinear")
+
+
+def smoothed(stokes: Tensor, valid: Tensor, side: int) -> Tensor:
+    """Stokes values (B, 3, S, S) averaged over the valid pixels (B, 1, S, S) of boxes of odd `side`."""
+    if side == 1:
+        return stokes
+    weight = valid.to(stokes.dtype)
+    sums = F.avg_pool2d(torch.cat([stokes * weight, weight], dim=1), side, 1, side // 2)
+    return sums[:, :3] / sums[:, 3:].clamp_min(1e-6)
 
 
 def visible_surface(

@@ -16,6 +16,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from dataset.errors import ToolkitError, ToolkitWarning
+from dataset.polarimetry import Stokes
 from dataset.session import Session, mask_box
 from dataset.session.edit import write_depth
 from s2p3 import config as presets
@@ -35,7 +36,7 @@ from s2p3.training.mean_teacher import MeanTeacher
 from s2p3.training.physics_signal import captured_signal, labelled_signal, objection, report_signal
 from s2p3.training.pseudo_labels import labels_of, make_labels
 from s2p3.training.self6d import self_supervise_rgbd
-from s2p3.training.self_supervised import clouds, visible_surface
+from s2p3.training.self_supervised import clouds, smoothed, visible_surface
 from tests.s2p3.untrained import save_untrained
 
 pytestmark = pytest.mark.filterwarnings("ignore::dataset.errors.ToolkitWarning")
@@ -291,6 +292,34 @@ def test_unpolarized_light_is_warned_about(cup_session: Path, cup: ObjectModel, 
         warnings.simplefilter("error")
         report_signal(labelled_signal(crops, torch.arange(8), cup), tmp_path / "student.safetensors")
     assert objection(Informativeness.mean([])) is not None
+
+
+def test_the_physics_sees_what_was_measured_not_what_was_augmented(cup_session: Path) -> None:
+    config, rows, view = tiny(), torch.arange(4), View.centred(4, 1.4)
+    crops = crops_of(cup_session, config)
+    plain = form_input(crops, rows, view, 1.5, config)
+    augmented = form_input(crops, rows, view, 1.5, config, torch.Generator().manual_seed(0))
+    assert torch.equal(augmented.stokes, plain.stokes)
+    assert not torch.equal(augmented.polarization, plain.polarization)
+
+
+def test_saturated_pixels_are_no_measurement(cup_session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, whole = tiny(), Session.stokes
+
+    def saturated(self: Session, index: int) -> Stokes:
+        stokes = whole(self, index)
+        valid = stokes.valid.copy()
+        valid[:, : valid.shape[1] // 2] = False
+        return dataclasses.replace(stokes, valid=valid)
+
+    before = crops_of(cup_session, config)
+    monkeypatch.setattr(Session, "stokes", saturated)
+    crops = crops_of(cup_session, config)
+    seen = form_input(crops, torch.arange(8), View.centred(8, 1.4), 1.5, config)
+    everywhere = form_input(before, torch.arange(8), View.centred(8, 1.4), 1.5, config)
+    assert 0 < seen.valid.float().mean() < everywhere.valid.float().mean()
+    spoilt = torch.where(seen.valid, seen.stokes, 7.0)
+    assert torch.equal(smoothed(spoilt, seen.valid, 3), smoothed(seen.stokes, seen.valid, 3))
 
 
 def test_depth_is_cut_on_the_grid_of_the_crops(with_depth: Path, cup: ObjectModel) -> None:

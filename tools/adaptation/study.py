@@ -1,13 +1,13 @@
 """Does self-supervision help? Synthetic sets of one object, frames of another domain, every control.
 
     python tools/adaptation/study.py --object cup --out out/study    goes on where it was stopped
-    python tools/adaptation/study.py --object cup --out out/study --split val    for tuning; publishes nothing
+    python tools/adaptation/study.py --object cup --out out/study --judged captured-val    for tuning
 
 Teacher and student are trained on path-traced and analytic sets of the domain `plain` (or, with --domain
 synthetic, of the varied one); the detector, whose boxes all share, on analytic images of the varied one. The
 "captured" frames are of the domain `captured` (other things on the table, another index, light, background,
-noise, blur, occluders); their poses serve the evaluation only. OBJECT.toml beside this file holds what
-was tuned on their split `val`. Results go to docs/adaptation/OBJECT-DOMAIN.json, of which page.py makes
+noise, blur, occluders), in three sets: one to adapt to, whose poses nobody reads; one to tune OBJECT.toml
+(beside this file) on; and the test. Results go to docs/adaptation/OBJECT-DOMAIN.json, of which page.py makes
 docs/adaptation.md.
 """
 
@@ -18,7 +18,7 @@ import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from datetime import date
@@ -30,8 +30,8 @@ import numpy as np
 import torch
 from page import RESULTS, table, write_page
 
+from dataset.errors import ToolkitError
 from dataset.session import Session
-from dataset.splits import split_session
 from s2p3 import objects
 from s2p3.config import ExperimentConfig, SelfSupervisionConfig, load
 from s2p3.evaluation import Evaluation, evaluate, find_objects
@@ -50,13 +50,14 @@ from s2p3.synthesis import (
 from s2p3.synthesis.scene import Backend
 from s2p3.training import captured_crops, self_supervise, train_detector, train_student, train_teacher
 from s2p3.training.adaptation import adapt_batch_norm
-from s2p3.training.checkpoint import CheckpointInfo, save
+from s2p3.training.checkpoint import CheckpointInfo, read_info, save
 from s2p3.training.pretrain import load_teacher
 
-CAPTURED_FRAMES, DETECTOR_FRAMES = 3200, 1800
-SHARES = {"train": 0.6, "val": 0.0875}  # the rest, a thousand frames, is the test
+TRACED_SEED, ANALYTIC_SEED, HELD_OUT_SEED = 0, 1, 2
 TRACED_HELD_OUT, ANALYTIC_HELD_OUT = 60, 300  # frames
-TRACED_SEED, ANALYTIC_SEED, HELD_OUT_SEED, DETECTOR_SEED, CAPTURED_SEED = 0, 1, 2, 3, 100
+DETECTOR_FRAMES, DETECTOR_SEED = 1800, 3
+CAPTURED_SETS = {"captured": (1920, 100), "captured-val": (280, 101), "captured-test": (1000, 102)}
+"""Frames and seed of the set to adapt to and of those to judge by."""
 
 Change = Callable[[SelfSupervisionConfig], SelfSupervisionConfig]
 
@@ -87,7 +88,7 @@ class Study:
         seeds: each trains teacher, student and every row anew; the sets and the detector are common.
         domain: name of the one that the training sets are drawn from.
         traced, analytic: synthetic frames to train on, by backend.
-        split: of the captured frames, that is evaluated.
+        judged: name of the captured set that is evaluated.
     """
 
     name: str
@@ -96,15 +97,11 @@ class Study:
     domain: str
     traced: int
     analytic: int
-    split: str
+    judged: str
 
     @property
     def settings_file(self) -> Path:
         return Path(__file__).with_name(f"{self.name}.toml")
-
-    @property
-    def captured(self) -> Path:
-        return self.out / "captured.h5"
 
     @property
     def detector_set(self) -> Path:
@@ -114,17 +111,19 @@ class Study:
     def detector(self) -> Path:
         return self.out / "detector" / "detector.safetensors"
 
-    @property
-    def found(self) -> Path:
-        """The detector's answers for all captured frames: every row of every seed sees the same."""
-        return self.out / "detector" / "found.npz"
+    def set(self, name: str) -> Path:
+        return self.out / f"{name}.h5"
+
+    def found(self, name: str) -> Path:
+        """The detector's answers for a captured set: every row of every seed sees the same."""
+        return self.detector.with_name(f"{name}.npz")
 
     def training_sets(self) -> list[Path]:
         sets = {"traced": self.traced, "analytic": self.analytic}
-        return [self.out / f"{name}.h5" for name, count in sets.items() if count]
+        return [self.set(name) for name, count in sets.items() if count]
 
-    def held_out_sets(self) -> list[Path]:
-        return [path.with_name(f"{path.stem}-held-out.h5") for path in self.training_sets()]
+    def held_out(self) -> list[str]:
+        return [f"{path.stem}-held-out" for path in self.training_sets()]
 
     def checkpoint(self, row: str, seed: int) -> Path:
         folder = self.out / f"seed-{seed}" / row.replace(" ", "-").replace(",", "").replace("'", "")
@@ -143,40 +142,60 @@ class Study:
             self_supervision=replace(config.self_supervision, seed=seed),
         )
 
+    def stage(self, row: str, seed: int) -> tuple[Path, str, object]:
+        """The checkpoint of a row, and the part of its experiment that it was trained by: name and value."""
+        config, path = self.experiment(seed), self.checkpoint(row, seed)
+        if row in (TEACHER, BEFORE):
+            return path, path.stem, getattr(config, path.stem)
+        change = TRAINED.get(row, lambda settings: settings)
+        return path, "self_supervision", change(config.self_supervision)
+
 
 def make_sets(study: Study, workers: int) -> None:
-    """Renders the sets that are missing, and divides the captured frames."""
+    """Renders the sets that are missing."""
     trained_on = DOMAINS[study.domain]
     makers: list[tuple[Path, int, int, Domain, Backend]] = [
-        (study.captured, CAPTURED_FRAMES, CAPTURED_SEED, CAPTURED, Analytic()),
-        (study.detector_set, DETECTOR_FRAMES, DETECTOR_SEED, SYNTHETIC, Analytic()),
+        (study.set(name), count, seed, CAPTURED, Analytic()) for name, (count, seed) in CAPTURED_SETS.items()
     ]
+    makers.append((study.detector_set, DETECTOR_FRAMES, DETECTOR_SEED, SYNTHETIC, Analytic()))
     backends: dict[str, tuple[Backend, int, int, int]] = {}
     if study.analytic:
         backends["analytic"] = (Analytic(), study.analytic, ANALYTIC_SEED, ANALYTIC_HELD_OUT)
     if study.traced:
         backends["traced"] = (PathTraced.here(), study.traced, TRACED_SEED, TRACED_HELD_OUT)
     for name, (backend, count, seed, held_out) in backends.items():
-        makers.append((study.out / f"{name}.h5", count, seed, trained_on, backend))
-        makers.append((study.out / f"{name}-held-out.h5", held_out, HELD_OUT_SEED, trained_on, backend))
+        makers.append((study.set(name), count, seed, trained_on, backend))
+        makers.append((study.set(f"{name}-held-out"), held_out, HELD_OUT_SEED, trained_on, backend))
     model = objects.build(study.name)
     for path, count, seed, domain, backend in makers:
         if not path.exists():
             print(f"{path.name}: {count} frames", flush=True)
             print(synthesize(model, count, session_camera(), seed, path, workers, None, domain, backend))
-    with Session.open(study.captured) as session:
-        divided = "test" in session.splits
-    if not divided:
-        split_session(study.captured, "frame", **SHARES, seed=CAPTURED_SEED)
+
+
+def check_settings(study: Study) -> None:
+    """Raises ToolkitError: a checkpoint in the folder was trained by settings other than those of today."""
+    stages = [study.stage(row, seed) for seed in study.seeds for row in ROWS]
+    stages.append((study.detector, "detector", study.experiment(0).detector))
+    for path, name, settings in stages:
+        if path.exists():
+            config, today = read_info(path).config, study.experiment(0)
+            shared = all(getattr(config, part) == getattr(today, part) for part in ("input", "augmentation"))
+            if not shared or config.network != today.network or getattr(config, name) != settings:
+                raise ToolkitError(
+                    f"{path}: was trained by other settings than {study.settings_file.name} now holds; "
+                    "delete it with what was made from it, or choose another --out"
+                )
 
 
 def train_network(study: Study, what: str, seed: int) -> None:
-    """Pre-trains a teacher, a student, or the detector, which then looks at all captured frames."""
+    """Pre-trains a teacher, a student, or the detector, which then looks at the captured sets."""
     config, model, cache = study.experiment(seed), objects.build(study.name), study.out / "crops"
     if what == "detector":
         if not study.detector.exists():
             train_detector([study.detector_set], model, config, study.detector.parent, _silent)
-        find_captured(study)
+        for name in CAPTURED_SETS:
+            find_captured(study, name)
     elif what == TEACHER:
         out = study.checkpoint(TEACHER, seed).parent
         train_teacher(study.training_sets(), model, config, out, cache, _silent)
@@ -185,54 +204,49 @@ def train_network(study: Study, what: str, seed: int) -> None:
         train_student(study.training_sets(), model, config, out, cache, teacher, _silent)
 
 
-def find_captured(study: Study) -> None:
-    """Runs the detector over all captured frames and keeps what it found."""
-    with Session.open(study.captured) as session:
+def find_captured(study: Study, name: str) -> None:
+    """Runs the detector over a captured set and keeps what it found."""
+    with Session.open(study.set(name)) as session:
         found = find_objects(session, range(len(session)), study.detector, study.name, _silent)
         shape = session.stokes(0).s0.shape
     masks = [np.zeros(shape, bool) if one is None else one.mask for one in found]
     boxes = [np.zeros(4) if one is None else one.box_xywh for one in found]
     scores = [np.nan if one is None else one.score for one in found]
-    np.savez_compressed(study.found, mask=np.packbits(masks, axis=-1), box=boxes, score=scores)
+    np.savez_compressed(study.found(name), mask=np.packbits(masks, axis=-1), box=boxes, score=scores)
 
 
-def found_in(study: Study, indices: Sequence[int]) -> list[Detection | None]:
-    """What the detector found in captured frames."""
-    with np.load(study.found) as kept, Session.open(study.captured) as session:
+def found_in(study: Study, name: str) -> list[Detection | None]:
+    """What the detector found in the frames of a captured set."""
+    with np.load(study.found(name)) as kept, Session.open(study.set(name)) as session:
         width = session.working_intrinsics.width
-        masks = np.unpackbits(kept["mask"][indices], axis=-1, count=width).astype(bool)
-        rows = zip(kept["box"][indices], masks, kept["score"][indices], strict=True)
+        masks = np.unpackbits(kept["mask"], axis=-1, count=width).astype(bool)
+        rows = zip(kept["box"], masks, kept["score"], strict=True)
         return [None if np.isnan(score) else Detection(box, mask, float(score)) for box, mask, score in rows]
 
 
 def adapt_network(study: Study, row: str, seed: int) -> None:
-    """Trains one row on the captured split `train`; no pose is read."""
+    """Trains one row on the captured set to adapt to; no pose is read."""
     config, model = study.experiment(seed), objects.build(study.name)
-    with Session.open(study.captured) as session:
-        indices = [int(index) for index in session.splits["train"]]
-        crops = captured_crops(session, indices, found_in(study, indices), config.input)
+    with Session.open(study.set("captured")) as session:
+        crops = captured_crops(session, range(len(session)), found_in(study, "captured"), config.input)
     teacher, student = study.checkpoint(TEACHER, seed), study.checkpoint(BEFORE, seed)
-    path = study.checkpoint(row, seed)
+    path, settings = study.checkpoint(row, seed), config.self_supervision
     if row == ADAPTED_TEACHER:
         network, info = load_teacher(teacher, model.name)
-        settings = replace(config.self_supervision, adapt_batches=ADABN)
         adapt_batch_norm(network, crops, model.refractive_index, config, settings)
         path.parent.mkdir(parents=True, exist_ok=True)
         save(path, network.state_dict(), CheckpointInfo.of("teacher", "AdaBN", model, 0, config, info.data))
     else:
-        settings = TRAINED[row](config.self_supervision)
-        self_supervise(crops, model, teacher, student, path.parent, settings, _silent)
+        self_supervise(crops, model, teacher, student, path.parent, TRAINED[row](settings), _silent)
 
 
 def judge_network(study: Study, row: str, seed: int, what: str) -> None:
-    """Evaluates one row on `what`: a split of the captured frames, or the held-out synthetic set so named."""
+    """Evaluates one row on the set called `what`."""
     model = objects.build(study.name)
-    captured = what in (*SHARES, "test")
-    with Session.open(study.captured if captured else study.out / f"{what}.h5") as session:
-        indices = [int(index) for index in session.splits[what]] if captured else list(range(len(session)))
-        found = found_in(study, indices) if captured else None
+    found = found_in(study, what) if what in CAPTURED_SETS else None
+    with Session.open(study.set(what)) as session:
         network = study.checkpoint(row, seed)
-        run = evaluate(session, indices, model, network, study.detector, found, _silent)
+        run = evaluate(session, range(len(session)), model, network, study.detector, found, _silent)
     run.save(study.evaluation(row, seed, what))
 
 
@@ -254,7 +268,9 @@ def run_all(jobs: Iterable[Job], workers: int) -> None:
 def run_study(study: Study, workers: int) -> None:
     """Every step whose file is missing."""
     study.out.mkdir(parents=True, exist_ok=True)
-    guides: list[Job] = [(study.found, train_network, (study, "detector", study.seeds[0]))]
+    check_settings(study)
+    last = study.found(list(CAPTURED_SETS)[-1])
+    guides: list[Job] = [(last, train_network, (study, "detector", study.seeds[0]))]
     students: list[Job] = []  # they may start from their teacher's encoders
     adaptation: list[Job] = []
     evaluation: list[Job] = []
@@ -263,8 +279,8 @@ def run_study(study: Study, workers: int) -> None:
             jobs.append((study.checkpoint(row, seed), train_network, (study, row, seed)))
         for row in (ADAPTED_TEACHER, *TRAINED):
             adaptation.append((study.checkpoint(row, seed), adapt_network, (study, row, seed)))
-        judged = [(row, study.split) for row in ROWS]
-        judged += [(row, path.stem) for row in (TEACHER, BEFORE) for path in study.held_out_sets()]
+        judged = [(row, study.judged) for row in ROWS]
+        judged += [(row, name) for row in (TEACHER, BEFORE) for name in study.held_out()]
         for row, what in judged:
             evaluation.append((study.evaluation(row, seed, what), judge_network, (study, row, seed, what)))
     make_sets(study, workers)
@@ -314,25 +330,25 @@ def result_of(study: Study) -> dict[str, Any]:
                 "depth_mm",
             )
             row_figures = {name: getattr(summary, name) for name in names}
-            found.append({"seed": seed, "metric": summary.metric, **row_figures})
+            commit = read_info(study.checkpoint(row, seed)).commit
+            found.append({"seed": seed, "metric": summary.metric, "commit": commit, **row_figures})
         return found
 
     def above(row: str, other: str) -> list[dict[str, float]]:
         found = []
         for seed in study.seeds:
-            runs = [Evaluation.load(study.evaluation(name, seed, study.split)) for name in (row, other)]
+            runs = [Evaluation.load(study.evaluation(name, seed, study.judged)) for name in (row, other)]
             difference = runs[0].above(runs[1])["recall_10"]
             low, high = difference.interval
             found.append({"seed": seed, "value": difference.value, "low": low, "high": high})
         return found
 
     return {
-        "split": study.split,
+        "judged": study.judged,
         "minutes": minutes_of(study),
-        "rows": {row: figures(row, study.split) for row in ROWS},
+        "rows": {row: figures(row, study.judged) for row in ROWS},
         "in_domain": {
-            path.stem: {row: figures(row, path.stem) for row in (TEACHER, BEFORE)}
-            for path in study.held_out_sets()
+            name: {row: figures(row, name) for row in (TEACHER, BEFORE)} for name in study.held_out()
         },
         "differences": {
             row: {other: above(row, other) for other in ROWS if other != row} for row in ROWS[3:]
@@ -351,7 +367,7 @@ def main() -> int:
     parser.add_argument("--traced", type=int, default=400, help="path-traced frames to train on")
     parser.add_argument("--analytic", type=int, default=3600, help="analytic frames to train on")
     parser.add_argument(
-        "--split", choices=(*SHARES, "test"), default="test", help="captured frames to judge by"
+        "--judged", choices=tuple(CAPTURED_SETS)[1:], default="captured-test", help="captured set to judge by"
     )
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
@@ -362,12 +378,12 @@ def main() -> int:
         options.domain,
         options.traced,
         options.analytic,
-        options.split,
+        options.judged,
     )
     run_study(study, options.workers)
     result = result_of(study)
     print(table(result))
-    if options.split == "test":
+    if options.judged == "captured-test":
         publish(f"{study.name}-{study.domain}", result)
     return 0
 

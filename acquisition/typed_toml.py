@@ -1,7 +1,8 @@
 """Typed TOML: a file of tables read into a tree of frozen dataclasses, every mistake named where it stands.
 
 A table is a dataclass, a key is a field. Field types: `bool`, `int`, `float`, `str`, `Literal[...]`, fixed
-and variable-length tuples of these, another dataclass (a table), and any of them `| None` (absent: `None`).
+and variable-length tuples of these, another dataclass (a table), a `dict` of texts, and any of them `| None`
+(absent: `None`).
 A dataclass refuses values out of range by raising `ToolkitError` in `__post_init__`; the reader adds file and
 table (once: a message may already begin with its table, as ``[motor]`` or ``motor:``).
 """
@@ -58,6 +59,12 @@ def loads(cls: type[T], text: str, source: str = "TOML text") -> T:
         last = f"line {text.count(chr(10)) + 1}, the end of the file"
         what = str(error).replace("end of document", last)
         raise ToolkitError(f"{source}: TOML syntax: {what}; correct that line") from error
+    return from_table(cls, table, source)
+
+
+def from_table(cls: type[T], table: Mapping[str, Any], source: str) -> T:
+    """Reads the dataclass tree `cls` from nested mappings, such as a parsed file, parts of which may be
+    dataclasses already; see `loads`."""
     value: T = _dataclass(cls, table, source, prefix="")
     return value
 
@@ -100,7 +107,9 @@ def _dataclass(cls: Any, table: Mapping[str, Any], source: str, prefix: str) -> 
 
 def _value(value: Any, annotation: Any, source: str, key: str) -> Any:
     """`value` as the annotated type; `key` is its dotted name."""
-    if dataclasses.is_dataclass(annotation):
+    if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+        if isinstance(value, annotation):
+            return value
         if not isinstance(value, Mapping):
             raise ToolkitError(f"{source}: {key} must be a table; write it as [{key}]")
         return _dataclass(annotation, value, source, key)
@@ -116,6 +125,10 @@ def _value(value: Any, annotation: Any, source: str, key: str) -> Any:
         return value
     if origin is tuple:
         return _tuple(value, arguments, source, key)
+    if origin is dict:
+        if not isinstance(value, Mapping):
+            raise ToolkitError(f"{source}: {key} must be a table; write it as [{key}]")
+        return {name: _value(item, arguments[1], source, f"{key}.{name}") for name, item in value.items()}
     if annotation is float:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
             raise ToolkitError(f"{source}: {key} must be a finite number, not {value!r}")

@@ -231,7 +231,8 @@ class Demo:
             synthesize(self.model, count, camera, self.seed, self.synthetic, workers, report, _DOMAIN)
 
     def train(self) -> None:
-        """A process and a thread each: the teacher beside the detector, which the student follows."""
+        """A process and a thread each: the teacher beside the detector, which the student follows. What is
+        finished stays."""
         words = ("--object", self.model.name, "--preset", self.plan.preset, "--workers", "0", "--out")
         common = (str(self.synthetic), *words)
 
@@ -239,18 +240,19 @@ class Demo:
             words = ("train", checkpoint.stem, *common, str(checkpoint.parent))
             return Training(words, checkpoint.with_suffix(".log.jsonl"), steps, after)
 
-        run_side_by_side(
-            {
-                "detector": training(self.detector, self.experiment.detector.steps),
-                "teacher": training(self.teacher, self.experiment.teacher.steps),
-                "student": training(self.student, self.experiment.student.steps, after="detector"),
-            }
-        )
+        steps, stages = self.experiment, (self.detector, self.teacher, self.student)
+        runs = {
+            "detector": training(self.detector, steps.detector.steps),
+            "teacher": training(self.teacher, steps.teacher.steps),
+            "student": training(self.student, steps.student.steps, after="detector"),
+        }
+        finished = [path.stem for path in stages if path.exists()]
+        run_side_by_side({name: run for name, run in runs.items() if name not in finished})
 
     def self_supervise(self) -> None:
-        adapt(
-            self.sequence, "train", self.model, self.detector, self.teacher, self.student, self.adapted.parent
-        )
+        if not self.adapted.exists():
+            networks = (self.detector, self.teacher, self.student)
+            adapt(self.sequence, "train", self.model, *networks, self.adapted.parent)
 
     def evaluate(self) -> None:
         networks = {"teacher": self.teacher, "before": self.student, "after": self.adapted}

@@ -12,8 +12,9 @@ from dataset.session import Session
 from s2p3.config import Self6DConfig, SelfSupervisionConfig
 from s2p3.evaluation import Estimator, Evaluation, evaluate, find_objects
 from s2p3.evaluation.evaluate import targets_of
-from s2p3.objects import ObjectModel
+from s2p3.objects import ObjectModel, poses_of
 from s2p3.training import captured_crops, self_supervise, self_supervise_rgbd
+from s2p3.training.checkpoint import to_write
 from s2p3.training.crops import depth_of
 from s2p3.training.self_supervised import load_pair
 
@@ -42,10 +43,11 @@ def adapt(
         SessionError: no such split.
         ToolkitError: the object is detected in no frame; checkpoints of another object.
     """
-    config = load_pair(teacher, student, model.name).config
+    to_write(out / "adapted.safetensors")  # this and the next are told before the detector has run
+    config = load_pair(teacher, student, model).config
     with Session.open(session) as opened:
         indices = frames_of(opened, split)
-        depth_of(opened, indices[0], config.input)  # a mistake is told before the detector has run
+        depth_of(opened, indices[0], config.input)
         detections = find_objects(opened, indices, detector, model.name)
         crops = captured_crops(opened, indices, detections, config.input)
     if isinstance(settings, Self6DConfig):
@@ -65,9 +67,9 @@ def evaluate_split(
     """
     with Session.open(session) as opened:
         indices = frames_of(opened, split)
-        targets_of(opened, indices, opened.object_poses(model.name), model.name)
+        targets_of(opened, indices, poses_of(opened, model), model.name)
         for network in networks.values():
-            Estimator.load(network, model.name)  # a mistake is told before the detector has run
+            Estimator.load(network, model)  # a mistake is told before the detector has run
         found = find_objects(opened, indices, detector, model.name)
         return {
             name: evaluate(opened, indices, model, network, detector, found)

@@ -6,6 +6,7 @@ S2P3 paper's table of refractive indices; the shapes themselves are our own (see
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +18,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
 from dataset import SE3, ToolkitError
-from dataset.session import ObjectRecord
+from dataset.session import ObjectPoses, ObjectRecord, Session
 from s2p3 import object_meshes
 from s2p3.materials import Kind, Material, load_material
 from s2p3.rendering.mesh import Mesh
@@ -25,6 +26,9 @@ from s2p3.symmetry import Proposal, Symmetry, propose
 
 if TYPE_CHECKING:
     import trimesh
+
+SAME_SIZE = 0.01
+"""Share of the diameter by which two meshes of one object may differ: one may be simplified."""
 
 _LARGEST_M, _SMALLEST_M = 2.0, 0.005
 _PROPOSAL_POINTS = 150_000
@@ -62,6 +66,13 @@ class ObjectModel:
     def mesh(self) -> Mesh:
         """The same mesh prepared for rendering."""
         return Mesh.from_arrays(self.vertices, self.faces)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """A short hash of all that trainings depend on: name, shape, symmetry, refractive index."""
+        record = self.to_record()
+        what = f"{self.name} {record.sha256} {record.symmetry} {self.diameter} {self.refractive_index}"
+        return hashlib.sha256(what.encode()).hexdigest()[:16]
 
     def to_record(self) -> ObjectRecord:
         """As a session stores it."""
@@ -176,6 +187,26 @@ def named_object(
     beside = Path(mesh).with_suffix(".toml")
     file = material if material is not None else beside if beside.is_file() else None
     return load(mesh, name=name, made_of=Material() if file is None else load_material(file))
+
+
+def poses_of(session: Session, model: ObjectModel) -> ObjectPoses:
+    """The poses of an object in a session.
+
+    Raises:
+        SessionError: it was not annotated.
+        ToolkitError: it was annotated with a mesh of another size, or placed otherwise in its frame, so that
+            its poses are not this object's.
+    """
+    poses = session.object_poses(model.name)
+    vertices = session.object(model.name).vertices
+    theirs, ours = (np.stack([v.min(axis=0), v.max(axis=0)]) for v in (vertices, model.vertices))
+    apart = float(np.abs(theirs - ours).max())
+    if apart > SAME_SIZE * model.diameter:
+        raise ToolkitError(
+            f"{session.path}: its {model.name!r} has another mesh than the one given (their boxes are "
+            f"{1000 * apart:.1f} mm apart); give the mesh it was annotated with, or annotate again"
+        )
+    return poses
 
 
 def _made_of(model: ObjectModel, material: Material) -> ObjectModel:

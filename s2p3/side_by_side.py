@@ -58,7 +58,7 @@ def run_side_by_side(trainings: Mapping[str, Training]) -> None:
     with counting_many(trainings) as report, ExitStack() as stack:
         while len(done) < len(trainings):
             for name, training in trainings.items():
-                if name not in running and (training.after is None or training.after in done):
+                if name not in running and (training.after in done or training.after not in trainings):
                     running[name] = _start(training, stack)
             time.sleep(_POLL_S)
             for name, process in running.items():

@@ -157,6 +157,8 @@ def train_student(
     from s2p3.training import train_student as train
 
     _use(threads, frames.workers)
+    if teacher is not None and not chosen.student.warm_start:
+        raise ToolkitError("--teacher is what a warm start starts from; add --config.student.warm-start")
     model = named_object(object, mesh)
     say(str(train(_some(sessions), model, chosen, out, cache=out.parent, teacher=teacher, frames=frames)))
 

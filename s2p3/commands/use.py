@@ -109,7 +109,7 @@ def predict(
 
     at_least(1, **({} if count is None else {"count": count}), **({} if bits is None else {"bits": bits}))
     model = named_object(object, mesh)
-    find, estimate = Finder.load(detector, model.name), Estimator.load(network, model.name)
+    find, estimate = Finder.load(detector, model.name), Estimator.load(network, model)
     with opened_source(source, calibration, split, count, mosaic, bits) as shots:
         found = predictions(shots, find, estimate)
         for prediction in found if out is None else saved(found, model, out):

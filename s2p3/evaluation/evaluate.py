@@ -23,7 +23,7 @@ from s2p3.evaluation.predict import Estimator, Finder
 from s2p3.evaluation.records import Record, Ruler, Subject
 from s2p3.evaluation.summary import Difference, Summary, differences, grouped, of_same_targets, summarize
 from s2p3.networks.detector import Detection
-from s2p3.objects import ObjectModel
+from s2p3.objects import ObjectModel, poses_of
 from s2p3.training.progress import OnStep, reporting
 
 MINIMUM_VISIBLE = 0.1
@@ -125,9 +125,9 @@ def evaluate(
 
     Raises ToolkitError: no frame of `indices` shows the object; checkpoints missing or of another object.
     """
-    estimate = Estimator.load(network, model.name)
+    estimate = Estimator.load(network, model)
     find = Finder.load(detector, model.name)
-    poses = session.object_poses(model.name)
+    poses = poses_of(session, model)
     targets = targets_of(session, indices, poses, model.name)
     camera = session.working_intrinsics
     ruler = Ruler(model, camera, _known_views(session, poses))

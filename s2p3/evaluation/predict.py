@@ -20,6 +20,7 @@ from s2p3.networks.detector import Detection, DetectorNetwork, detect
 from s2p3.networks.onnx_files import OnnxNetwork
 from s2p3.networks.pose_head import decode_pose
 from s2p3.networks.teacher import TeacherOutput, pose_of
+from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
 from s2p3.training.batches import form_input
 from s2p3.training.checkpoint import CheckpointInfo
@@ -84,18 +85,18 @@ class Estimator:
     info: CheckpointInfo
 
     @staticmethod
-    def load(path: Path, object_name: str | None = None) -> Estimator:
+    def load(path: Path, wanted: str | ObjectModel | None = None) -> Estimator:
         """Reads a teacher's or a student's checkpoint, or the ONNX file of one.
 
         Raises ToolkitError as `checkpoint.read_info`.
         """
-        info = checkpoint.read_info(path, None, object_name)
+        info = checkpoint.read_info(path, None, wanted)
         if info.kind == "detector":
             raise ToolkitError(f"{path}: holds a detector, not a teacher or student; give one of theirs")
         if path.suffix == ".onnx":
             return Estimator(cast(PoseNetwork, _exported(path)), info)
         load = load_teacher if info.kind == "teacher" else load_student
-        return Estimator(*load(path, object_name))
+        return Estimator(*load(path, wanted))
 
     @torch.no_grad()
     def __call__(

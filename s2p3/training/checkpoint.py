@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -10,18 +11,20 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import torch.distributed as dist
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from acquisition import typed_toml
 from dataset.errors import ToolkitError
 from s2p3.config import ExperimentConfig
-from s2p3.objects import ObjectModel
+from s2p3.objects import SAME_SIZE, ObjectModel
 from s2p3.provenance import toolkit_state
 
 Kind = Literal["teacher", "student", "detector"]
 Network = TypeVar("Network", bound=nn.Module)
 FORMAT = "s2p3-checkpoint-1"
+_DESCRIPTION = "s2p3"
 RESUME = ".resume.safetensors"
 """What the file ends on from which the training of a checkpoint goes on."""
 
@@ -52,7 +55,8 @@ class CheckpointInfo:
             of the first.
         step: optimizer steps after which the weights were these.
         config: the whole experiment.
-        data: hashes of what it was trained on, by session id.
+        data: hashes of what it was trained and validated on, by session id; of a self-supervised student, of
+            the "crops", and of the checkpoints of "teacher" and "student" that it came from.
         commit: of the toolkit.
         validation: None where the last weights were kept.
         classes: of a detector, its objects in the order of its masks.
@@ -100,9 +104,25 @@ class CheckpointInfo:
         )
 
 
+def to_write(path: Path) -> Path:
+    """`path`, where a training may leave its checkpoint, or goes on.
+
+    Raises ToolkitError: a finished one has left its there.
+    """
+    if path.exists() and not path.with_suffix(RESUME).exists():
+        raise ToolkitError(f"{path} is there already; delete it to train anew, or choose another folder")
+    return path
+
+
+def file_hash(path: Path) -> str:
+    """A short hash of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
 def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
-    """Writes `path` (NAME.safetensors) and NAME.json, the weights last and atomically; the weights' own
-    metadata says the same as NAME.json. The resume file is done with.
+    """Writes `path` (NAME.safetensors) and NAME.json, each atomically, the weights last; the weights' own
+    metadata says the same as NAME.json, so that no other
+    weights pass for these. The resume file is done with.
 
     Of several processes that train together the first one writes, and the others wait for it.
     """
@@ -111,12 +131,19 @@ def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         description = {"format": FORMAT, **asdict(info), "config": typed_toml.dumps(info.config)}
         text = json.dumps(description, indent=1)
-        path.with_suffix(".json").write_text(text, encoding="utf-8")
-        save_tensors(path, weights, {"s2p3": text})
+        save_text(path.with_suffix(".json"), text)
+        save_tensors(path, weights, {_DESCRIPTION: text})
         shutil.copymode(path.with_suffix(".json"), path)  # safetensors writes for the owner only
         path.with_suffix(RESUME).unlink(missing_ok=True)
     if together:
         dist.barrier()
+
+
+def save_text(path: Path, text: str) -> None:
+    """Writes a text file atomically: a reader sees the old file or the new one."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:
@@ -126,11 +153,16 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str
     temporary.replace(path)
 
 
-def read_info(path: Path, kind: Kind | None = None, object_name: str | None = None) -> CheckpointInfo:
-    """Reads NAME.json of the checkpoint `path`.
+def read_info(
+    path: Path, kind: Kind | None = None, wanted: str | ObjectModel | None = None
+) -> CheckpointInfo:
+    """Reads NAME.json of the checkpoint `path`, a network in NAME.safetensors or NAME.onnx.
 
-    Raises ToolkitError: missing or foreign files, a network of another kind than `kind`, of another object
-    than `object_name`.
+    Args:
+        wanted: the object, or its name.
+
+    Raises ToolkitError: missing, damaged or foreign files; a network of another kind than `kind`, of another
+        object than the one wanted, or of an object of that name of another size.
     """
     description = path.with_suffix(".json")
     for needed in (path, description):
@@ -138,37 +170,63 @@ def read_info(path: Path, kind: Kind | None = None, object_name: str | None = No
             raise ToolkitError(
                 f"{needed}: no such file; a checkpoint is NAME.safetensors with NAME.json beside it"
             )
-    try:
-        values: dict[str, Any] = json.loads(description.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ToolkitError(f"{description}: not JSON ({error}); train again or restore the file") from error
-    if values.pop("format", None) != FORMAT:
-        raise ToolkitError(f"{description}: not a checkpoint this version reads ({FORMAT}); train again")
-    try:
-        config = typed_toml.loads(ExperimentConfig, values.pop("config"), source=str(description))
-        validation = values.pop("validation", None)
-        validation = None if validation is None else Validation(**validation)
-        classes = tuple(values.pop("classes", ()))
-        info = CheckpointInfo(config=config, validation=validation, classes=classes, **values)
-    except (TypeError, KeyError) as error:
-        raise ToolkitError(f"{description}: fields missing or unknown ({error}); train again") from error
+    text = description.read_text(encoding="utf-8", errors="replace")
+    info = _info(text, description)
+    if path.suffix == ".safetensors" and _described(path) != text:
+        raise ToolkitError(
+            f"{path}: the weights are not those that {description} describes; restore both, or train again"
+        )
     if kind is not None and info.kind != kind:
         raise ToolkitError(f"{path}: holds a {info.kind}, not a {kind}; give the {kind}'s checkpoint")
-    if object_name is not None and object_name not in info.names:
+    name = wanted.name if isinstance(wanted, ObjectModel) else wanted
+    if name is not None and name not in info.names:
         raise ToolkitError(
-            f"{path}: was trained for {', '.join(map(repr, info.names))}, not {object_name!r}; "
-            f"train a {info.kind} for {object_name!r}"
+            f"{path}: was trained for {', '.join(map(repr, info.names))}, not {name!r}; "
+            f"train a {info.kind} for {name!r}"
         )
+    if isinstance(wanted, ObjectModel) and info.kind != "detector":
+        trained, given = 1000 * info.diameter_m, 1000 * wanted.diameter
+        if abs(trained - given) > SAME_SIZE * given:
+            raise ToolkitError(
+                f"{path}: was trained for a {name!r} of {trained:.1f} mm, and this one has {given:.1f} mm; "
+                "give the mesh it was trained with, or train again"
+            )
     return info
+
+
+def _info(text: str, description: Path) -> CheckpointInfo:
+    try:
+        values: dict[str, Any] = json.loads(text)
+        known = isinstance(values, dict) and values.pop("format", None) == FORMAT
+    except ValueError as error:
+        raise ToolkitError(f"{description}: not JSON ({error}); train again or restore the file") from error
+    if not known:
+        raise ToolkitError(f"{description}: not a checkpoint this version reads ({FORMAT}); train again")
+    config = values.get("config")
+    if isinstance(config, str):
+        values["config"] = typed_toml.loads(ExperimentConfig, config, source=str(description))
+    values = {name: value for name, value in values.items() if value is not None}
+    return typed_toml.from_table(CheckpointInfo, values, str(description))
+
+
+def _described(path: Path) -> str | None:
+    """What the weights' own metadata says they are. Raises ToolkitError: damaged weights."""
+    try:
+        with safe_open(path, "pt") as file:
+            return (file.metadata() or {}).get(_DESCRIPTION)
+    except (OSError, SafetensorError) as error:
+        raise ToolkitError(f"{path}: damaged ({error}); restore the file, or train again") from error
 
 
 def load_weights(network: Network, path: Path) -> Network:
     """Fills `network` with the weights at `path`, puts it in evaluation mode, and returns it.
 
-    Raises ToolkitError: the weights do not fit the network.
+    Raises ToolkitError: the weights are damaged, or do not fit the network.
     """
     try:
         network.load_state_dict(load_file(path))
+    except (OSError, SafetensorError) as error:
+        raise ToolkitError(f"{path}: damaged ({error}); restore the file, or train again") from error
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise ToolkitError(f"{path}: does not fit this network ({reason}); train again") from error

@@ -9,7 +9,7 @@ annotated) session.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ from dataset.session import Session, mask_box
 from s2p3.config import InputConfig
 from s2p3.inputs import crop_intrinsics, extract_crop, extract_depth, square_box
 from s2p3.networks.detector import Detection
-from s2p3.objects import ObjectModel, Symmetry
+from s2p3.objects import ObjectModel, Symmetry, poses_of
 from s2p3.rendering import rasterize
 from s2p3.training.checkpoint import save_tensors
 from s2p3.training.progress import OnStep, reporting
@@ -89,18 +89,29 @@ class LabelledCrops(Crops):
 
 def content_hashes(paths: Sequence[Path], model: ObjectModel) -> dict[str, str]:
     """What trainings on sessions depend on, by session id: short hashes of the images' checksums, the
-    calibration and the object's poses."""
-    hashes = {}
+    calibration, the object's poses and how it is seen.
+
+    Raises ToolkitError: a session is given twice; see also `poses_of`.
+    """
+    hashes: dict[str, str] = {}
     for path in paths:
         with Session.open(path) as session:
             digest = hashlib.sha256(session.contents.read("camera/crc32", slice(len(session))).tobytes())
             if session.has_depth:
                 digest.update(session.contents.read("depth_crc32", slice(len(session))).tobytes())
-            camera, poses = session.working_intrinsics, session.object_poses(model.name)
-            for part in (camera.K, camera.distortion, poses.T_cam_obj.as_matrix(), poses.bbox_xywh):
+            camera, poses = session.working_intrinsics, poses_of(session, model)
+            views = (poses.T_cam_obj.as_matrix(), poses.bbox_xywh, poses.visible_fraction)
+            for part in (camera.K, camera.distortion, *views):
                 digest.update(np.ascontiguousarray(part).tobytes())
-            hashes[session.session_id] = digest.hexdigest()[:16]
+            hashes[once(session, hashes)] = digest.hexdigest()[:16]
     return hashes
+
+
+def once(session: Session, before: Container[str]) -> str:
+    """The session's id. Raises ToolkitError: it is among those that were given before."""
+    if session.session_id in before:
+        raise ToolkitError(f"{session.path}: this session was given before; name each one once")
+    return session.session_id
 
 
 def crops_hash(crops: Crops) -> str:
@@ -114,7 +125,7 @@ def crops_hash(crops: Crops) -> str:
 def fingerprint(paths: Sequence[Path], model: ObjectModel, config: InputConfig) -> str:
     """A short hash of which sessions, which object and which crops."""
     hashes = content_hashes(paths, model)
-    return hashlib.sha256(f"{model.name} {config} {hashes}".encode()).hexdigest()[:16]
+    return hashlib.sha256(f"{model.fingerprint} {config} {hashes}".encode()).hexdigest()[:16]
 
 
 def labelled_crops(
@@ -140,7 +151,7 @@ def labelled_crops(
     with reporting(f"crops of {model.name}", len(shown), on_step) as report:
         for number, path in enumerate(paths):
             with Session.open(path) as session:
-                poses = session.object_poses(model.name)
+                poses = poses_of(session, model)
                 for index in (index for which, index in shown if which == number):
                     stokes = np.moveaxis(session.stokes(index).stack(), 0, -1)
                     mask, pose = poses.mask(index), poses.T_cam_obj[index]
@@ -172,7 +183,7 @@ def shown_rows(paths: Sequence[Path], model: ObjectModel) -> list[tuple[int, int
     rows = []
     for number, path in enumerate(paths):
         with Session.open(path) as session:
-            poses = session.object_poses(model.name)
+            poses = poses_of(session, model)
             seen = (poses.visible_fraction >= _MINIMUM_VISIBLE) & (poses.bbox_xywh[:, 2:].min(axis=1) > 0)
             rows += [(number, int(index)) for index in np.flatnonzero(seen)]
     if not rows:

@@ -20,7 +20,7 @@ from s2p3.networks.lite0 import channels_last
 from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
 from s2p3.training.checkpoint import CheckpointInfo, Validation
-from s2p3.training.crops import content_hashes
+from s2p3.training.crops import content_hashes, once
 from s2p3.training.examples import MOST_HELD_OUT
 from s2p3.training.loop import Forward, Losses, Score, optimize
 from s2p3.training.progress import OnStep, reporting
@@ -106,9 +106,9 @@ def train_detector(
     """
     models = [models] if isinstance(models, ObjectModel) else list(models)
     names, settings = [model.name for model in models], config.detector
-    path = out / "detector.safetensors"
-    frames = small_frames(sessions, names, settings.level)
+    path = checkpoint.to_write(out / "detector.safetensors")
     hashes = _hashes(sessions, models)
+    frames = small_frames(sessions, names, settings.level)
     order = torch.randperm(len(frames), generator=torch.Generator().manual_seed(settings.seed))
     count = min(int(settings.holdout * len(frames)), MOST_HELD_OUT) if settings.validations else 0
     data, score = FrameData(frames, order[count:].sort().values), None
@@ -191,9 +191,9 @@ def _hashes(sessions: Sequence[Path], models: Sequence[ObjectModel]) -> dict[str
     for path in sessions:
         with Session.open(path) as session:
             here = [one for one in models if session.contents.has(f"poses/objects/{one.name}")]
-        for model in here:
-            for session_id, digest in content_hashes([path], model).items():
-                hashes[session_id] = f"{hashes.get(session_id, '')}{digest}"
+            hashes[once(session, hashes)] = "".join(
+                digest for model in here for digest in content_hashes([path], model).values()
+            )
     return hashes
 
 

@@ -14,7 +14,7 @@ from dataset.errors import ToolkitError
 from dataset.session import Session
 from s2p3.config import FrameSource, InputConfig, SupervisedConfig
 from s2p3.objects import ObjectModel
-from s2p3.training.crops import LabelledCrops, labelled_crops, shown_rows
+from s2p3.training.crops import LabelledCrops, content_hashes, labelled_crops, shown_rows
 from s2p3.training.loader import CropDataset
 
 MOST_HELD_OUT = 256
@@ -40,12 +40,14 @@ class Examples:
         rows: of these, those to learn from.
         held_out: the others; None where there are none.
         origin: of the others, in words.
+        hashes: of all sessions, see `content_hashes`.
     """
 
     source: CropSource
     rows: Tensor
     held_out: LabelledCrops | None
     origin: str
+    hashes: dict[str, str]
 
     @staticmethod
     def of(
@@ -61,19 +63,22 @@ class Examples:
         Args:
             cache: see `labelled_crops`.
 
-        Raises ToolkitError: a session lacks the object or the split, or no frame shows it.
+        Raises ToolkitError: a session lacks the object or the split, or is given twice; no frame shows it.
         """
         division = divide(sessions, model, settings, frames)
+        scored_on = [] if division.session is None else [division.session]
+        hashes = content_hashes([*sessions, *scored_on], model)
         source: CropSource
         if frames.storage == "memory":
             source = labelled_crops(sessions, model, config, cache)
         else:
             source = CropDataset(sessions, model, config)
-        if division.session is not None:
-            other = labelled_crops([division.session], model, config, cache)
-            return Examples(source, division.rows, other, division.origin)
-        held_out = source.take(division.held_out) if len(division.held_out) else None
-        return Examples(source, division.rows, held_out, division.origin)
+        held_out = None
+        if scored_on:
+            held_out = labelled_crops(scored_on, model, config, cache)
+        elif len(division.held_out):
+            held_out = source.take(division.held_out)
+        return Examples(source, division.rows, held_out, division.origin, hashes)
 
 
 @dataclass(frozen=True)

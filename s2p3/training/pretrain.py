@@ -27,7 +27,6 @@ from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
 from s2p3.training.batches import Targets, form_input, form_targets
 from s2p3.training.checkpoint import CheckpointInfo, Kind, Validation
-from s2p3.training.crops import content_hashes
 from s2p3.training.examples import CropSource, Examples
 from s2p3.training.loop import Forward, Losses, Objective, Score, optimize
 from s2p3.training.physics_signal import labelled_signal, report_signal
@@ -61,13 +60,13 @@ def train_teacher(
 
     Raises ToolkitError: a session lacks the object; see also `loop.optimize`.
     """
-    settings = config.teacher
+    path, settings = checkpoint.to_write(out / "teacher.safetensors"), config.teacher
     examples = Examples.of(sessions, model, config.input, settings, frames, cache)
     torch.manual_seed(settings.seed)
     network = build_teacher(config, imagenet=True)
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
-    run = Pretraining("teacher", model, config, settings, examples, content_hashes(sessions, model), stage)
-    return run.train(network, objective, out, frames.workers, on_step)
+    run = Pretraining("teacher", model, config, settings, examples, stage)
+    return run.train(network, objective, path, frames.workers, on_step)
 
 
 def train_student(
@@ -90,7 +89,7 @@ def train_student(
 
     Raises ToolkitError: a warm start without a teacher, or of another object's; see also `train_teacher`.
     """
-    settings = config.student
+    path, settings = checkpoint.to_write(out / "student.safetensors"), config.student
     examples = Examples.of(sessions, model, config.input, settings, frames, cache)
     torch.manual_seed(settings.seed)
     network = build_student(config, imagenet=True)
@@ -99,10 +98,10 @@ def train_student(
             raise ToolkitError(
                 "student.warm_start needs the teacher's checkpoint; give it, or set warm_start = false"
             )
-        network.encoder.load_state_dict(load_teacher(teacher, model.name)[0].encoder.state_dict())
+        network.encoder.load_state_dict(load_teacher(teacher, model)[0].encoder.state_dict())
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
-    run = Pretraining("student", model, config, settings, examples, content_hashes(sessions, model), stage)
-    return run.train(network, objective, out, frames.workers, on_step)
+    run = Pretraining("student", model, config, settings, examples, stage)
+    return run.train(network, objective, path, frames.workers, on_step)
 
 
 @dataclass(frozen=True)
@@ -114,19 +113,18 @@ class Pretraining:
     config: ExperimentConfig
     settings: PretrainConfig
     examples: Examples
-    hashes: dict[str, str]
     stage: Stage
 
     def train(
         self,
         network: Student | Teacher,
         objective: Objective,
-        out: Path,
+        path: Path,
         workers: int,
         on_step: OnStep | None,
     ) -> Path:
-        """Optimizes `network` and writes `out`/KIND.safetensors, which is returned."""
-        path, examples, index = out / f"{self.kind}.safetensors", self.examples, self.model.refractive_index
+        """Optimizes `network` and writes the checkpoint `path`, which is returned."""
+        examples, index = self.examples, self.model.refractive_index
         report_signal(labelled_signal(examples.source, examples.rows, self.model), path)
         data = LabelledData(examples.source, examples.rows, index, self.config)
         score = None
@@ -134,7 +132,7 @@ class Pretraining:
             scorer = PoseScorer(examples.held_out, self.model, self.config)
             score = Score(scorer.name, scorer, self.settings.validations)
         rows = examples.rows.tolist()
-        fingerprint = f"{self.hashes} {self.config} {self.model.name} {rows} {examples.origin}"
+        fingerprint = f"{examples.hashes} {self.config} {self.model.fingerprint} {rows} {examples.origin}"
         trained = optimize(
             network,
             data,
@@ -151,21 +149,23 @@ class Pretraining:
         if score is not None and trained.score is not None:
             validation = Validation(score.name, trained.score, examples.origin)
         info = CheckpointInfo.of(
-            self.kind, self.stage, self.model, trained.step, self.config, self.hashes, validation
+            self.kind, self.stage, self.model, trained.step, self.config, examples.hashes, validation
         )
         checkpoint.save(path, trained.network.state_dict(), info)
         return path
 
 
-def load_teacher(path: Path, object_name: str | None = None) -> tuple[Teacher, CheckpointInfo]:
+def load_teacher(path: Path, wanted: str | ObjectModel | None = None) -> tuple[Teacher, CheckpointInfo]:
     """Reads a teacher. Raises ToolkitError as `checkpoint.read_info` and `checkpoint.load_weights`."""
-    info = checkpoint.read_info(path, "teacher", object_name)
+    info = checkpoint.read_info(path, "teacher", wanted)
     return checkpoint.load_weights(build_teacher(info.config), path), info
 
 
-def load_student(path: Path, object_name: str | None = None) -> tuple[Student | Teacher, CheckpointInfo]:
+def load_student(
+    path: Path, wanted: str | ObjectModel | None = None
+) -> tuple[Student | Teacher, CheckpointInfo]:
     """Reads a student. Raises ToolkitError as `checkpoint.read_info` and `checkpoint.load_weights`."""
-    info = checkpoint.read_info(path, "student", object_name)
+    info = checkpoint.read_info(path, "student", wanted)
     return checkpoint.load_weights(build_student(info.config), path), info
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -63,19 +63,23 @@ class State:
     def restore(self) -> int:
         """Reads the file, if there is one; returns how many steps are done.
 
-        Raises ToolkitError: it was left by another training.
+        Raises ToolkitError: it is damaged, or was left by another training.
         """
         if not self.path.exists():
             return 0
-        with safe_open(self.path, "pt") as file:
-            metadata = file.metadata()
+        try:
+            with safe_open(self.path, "pt") as file:
+                metadata = file.metadata() or {}
+            tensors = load_file(self.path)
+        except (OSError, SafetensorError) as error:
+            raise ToolkitError(f"{self.path}: damaged ({error}); delete it to start anew") from error
         if metadata.get("run") != self.run:
             raise ToolkitError(
                 f"{self.path}: was left by a run with other settings or data; "
                 "delete it, or choose another output folder"
             )
         parts: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimizer": {}, "best": {}}
-        for name, value in load_file(self.path).items():
+        for name, value in tensors.items():
             part, rest = name.split(".", 1)
             parts[part][rest] = value
         self.network.load_state_dict(parts["network"])

@@ -60,7 +60,9 @@ def self_supervise_rgbd(
 
     Raises ToolkitError: the networks see polarization; the session has no depth; see also `self_supervise`.
     """
-    pair = load_pair(teacher, student, model.name)
+    path = checkpoint.to_write(out / "adapted.safetensors")
+    pair = load_pair(teacher, student, model)
+    hashes = pair.hashes | {"crops": crops_hash(crops)}
     if pair.config.input.modality == "polarization":
         raise ToolkitError(
             f"{student} sees polarization, which the baseline must not; train teacher and student with "
@@ -75,14 +77,13 @@ def self_supervise_rgbd(
     freeze_norms(pair.student)
     data = CapturedData(crops, labels, mesh, model.refractive_index, pair.config)
     objective = _Objective(mesh, *model_tensors(model), model.diameter, perceptual, settings)
-    path, hashes = out / "adapted.safetensors", {"crops": crops_hash(crops)}
     trained = optimize(
         pair.student,
         data,
         objective,
         settings,
         path,
-        f"{hashes} {pair.described}",
+        f"{hashes} {model.fingerprint} {pair.config}",
         "self-supervision (RGB-D)",
         workers=workers,
         on_step=on_step,

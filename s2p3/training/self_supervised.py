@@ -60,7 +60,8 @@ def self_supervise(
     Raises ToolkitError: checkpoints of another object or of different inputs; a depth loss without depth; a
         teacher that is to follow a student of another architecture; see also `loop.optimize`.
     """
-    pair = load_pair(teacher, student, model.name)
+    path = checkpoint.to_write(out / "adapted.safetensors")
+    pair = load_pair(teacher, student, model)
     settings = settings or pair.config.self_supervision
     if settings.depth != "none" and crops.depth is None:
         raise ToolkitError(
@@ -74,7 +75,6 @@ def self_supervise(
             adapt_batch_norm(pair.teacher, crops, model.refractive_index, pair.config, settings)
     mesh = RenderMesh.from_mesh(model.mesh)
     labels = make_labels(pair.teacher, crops, model, mesh, pair.config)
-    path = out / "adapted.safetensors"
     report_signal(captured_signal(crops, labels.rotation, labels.translation, model), path)
     if settings.freeze_norms:
         freeze_norms(pair.student)
@@ -90,14 +90,14 @@ def self_supervise(
         model.refractive_index,
         settings,
     )
-    hashes = {"crops": crops_hash(crops)}
+    hashes = pair.hashes | {"crops": crops_hash(crops)}
     trained = optimize(
         network,
         data,
         objective,
         settings,
         path,
-        f"{hashes} {pair.described}",
+        f"{hashes} {model.fingerprint} {pair.config}",
         "self-supervision",
         workers=workers,
         on_step=on_step,
@@ -111,23 +111,24 @@ def self_supervise(
 
 @dataclass(frozen=True)
 class Pair:
-    """Teacher and student that see the same, the experiment they share, and what they are, in words."""
+    """Teacher and student that see the same, the student's experiment, and hashes of both files."""
 
     teacher: Teacher
     student: Student | Teacher
     config: ExperimentConfig
-    described: str
+    hashes: dict[str, str]
 
 
-def load_pair(teacher: Path, student: Path, object_name: str) -> Pair:
+def load_pair(teacher: Path, student: Path, model: ObjectModel) -> Pair:
     """Reads both. Raises ToolkitError: of another object, or of different inputs."""
-    guide, guide_info = load_teacher(teacher, object_name)
-    network, info = load_student(student, object_name)
+    guide, guide_info = load_teacher(teacher, model)
+    network, info = load_student(student, model)
     if guide_info.config.input != info.config.input:
         raise ToolkitError(
             f"{teacher} and {student} expect different inputs; train both with one experiment.toml"
         )
-    return Pair(guide, network, info.config, f"{guide_info} {info}")
+    hashes = {"teacher": checkpoint.file_hash(teacher), "student": checkpoint.file_hash(student)}
+    return Pair(guide, network, info.config, hashes)
 
 
 @dataclass(frozen=True)

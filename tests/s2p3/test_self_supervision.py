@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from dataset.errors import ToolkitError, ToolkitWarning
 from dataset.polarimetry import Stokes
@@ -74,9 +74,10 @@ def with_depth(cup_session: Path, cup: ObjectModel, tmp_path_factory: pytest.Tem
 
 def confident(networks: dict[str, Path]) -> dict[str, Path]:
     """The same networks, the teacher sure that it sees the object everywhere."""
-    weights = load_file(networks["teacher"])
+    path = networks["teacher"]
+    weights = load_file(path)
     weights["maps.bias"][0] = 5.0
-    save_file(weights, networks["teacher"])
+    checkpoint.save(path, weights, checkpoint.read_info(path))
     return networks
 
 

@@ -34,6 +34,7 @@ from s2p3.training.progress import OnStep, reporting
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+_ASKEW = np.array([0.36, 0.48, 0.8])  # a direction that is no axis of any usual symmetry
 _MINIMUM_VISIBLE = 0.3  # our choice: frames that show less of the object than this are not trained on
 
 
@@ -75,8 +76,8 @@ class LabelledCrops(Crops):
     """Crops with their truth.
 
     Attributes:
-        rotation, translation: (N, 3, 3) and (N, 3) of T_cam_obj; for an object with a symmetry axis, of the
-            equivalent pose whose turn about the axis is fixed by the viewing direction.
+        rotation, translation: (N, 3, 3) and (N, 3) of T_cam_obj; for a symmetric object, of the equivalent
+            pose that `canonical_pose` chooses by the viewing direction.
         normals: (N, 3, P, P) float16, camera frame, zero outside the object.
         coordinates: (N, 3, P, P) float16, -1 to 1 across the object's bounding box, zero outside.
     """
@@ -281,11 +282,15 @@ def single_crop(
 
 
 def canonical_pose(pose: SE3, symmetry: Symmetry) -> SE3:
-    """The pose among those a symmetry axis makes equivalent that shows the camera on a fixed side; others as
-    they are."""
-    if symmetry.axis is None:
-        return pose
+    """The pose that, among its equivalents under a symmetry, shows the camera on a fixed side: maps of
+    coordinates would contradict each other otherwise (our choice). Without a symmetry the pose itself."""
     axis = symmetry.axis
+    if len(symmetry.transforms):
+        equivalent = SE3.stack([pose, *(pose @ SE3.from_matrix(motion) for motion in symmetry.transforms)])
+        side = _ASKEW if axis is None else axis
+        pose = equivalent[int(np.argmax(equivalent.inverse().translation @ side))]
+    if axis is None:
+        return pose
     towards = pose.inverse().translation
     towards = towards - axis * (axis @ towards)
     side = np.linalg.svd(axis[None])[2][1]  # any fixed direction across the axis

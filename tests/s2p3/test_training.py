@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import load_file
 
@@ -138,6 +139,18 @@ def test_a_symmetry_axis_leaves_one_pose(cup: ObjectModel) -> None:
     np.testing.assert_allclose(first.as_matrix(), second.as_matrix(), atol=1e-9)
     np.testing.assert_allclose(first.rotation[:, 2], pose.rotation[:, 2], atol=1e-9)
     assert canonical_pose(pose, cup.symmetry) is pose
+
+
+@pytest.mark.parametrize("axis", [None, np.array([0.0, 0.0, 1.0])], ids=["half turns", "cylinder"])
+def test_poses_that_look_the_same_have_one_target(axis: NDArray[np.float64] | None) -> None:
+    turns = [SE3.from_rotvec(np.pi * np.eye(3)[i], np.zeros(3)) for i in range(3)]
+    symmetry = Symmetry(np.stack([turn.as_matrix() for turn in turns]), axis)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        pose = SE3.from_rotvec(rng.normal(size=3), np.array([0.02, -0.05, 0.5]))
+        wanted = canonical_pose(pose, symmetry).as_matrix()
+        for turn in turns:
+            np.testing.assert_allclose(canonical_pose(pose @ turn, symmetry).as_matrix(), wanted, atol=1e-9)
 
 
 def test_teacher_and_student_learn(trained: Path) -> None:

@@ -27,6 +27,7 @@ The rows: networks *before*; with BatchNorm statistics re-estimated on captured 
 that only copies the poses of the teacher (*pose-only distillation*); one that learns from its maps, too
 (*without physics*); and the whole method, with the paper's physics or with ours.
 """
+METHOD = "student, DoLP physics (the paper's)"
 CONTROLS = (
     "student before",
     "student, AdaBN alone",
@@ -59,6 +60,8 @@ def table(result: dict[str, Any]) -> str:
             "| | " + " | ".join(f"above {other}" for other in CONTROLS) + " |",
             "|---" * (len(CONTROLS) + 1) + "|",
             *(_differences(row, found) for row, found in result["differences"].items()),
+            "",
+            _summary(result["differences"]),
             "",
             "In the domain trained on, on held-out frames, recall at 0.1 d by seed:",
             "",
@@ -115,6 +118,19 @@ def _differences(name: str, found: dict[str, list[dict[str, float]]]) -> str:
         for other in CONTROLS
     ]
     return f"| {name} | {' | '.join(cells)} |"
+
+
+def _summary(differences: dict[str, dict[str, list[dict[str, float]]]]) -> str:
+    """What the paper's method gains, in a sentence."""
+
+    def gain(other: str) -> str:
+        found = differences[METHOD][other]
+        clear = sum(each["low"] > 0 for each in found)
+        mean = np.mean([each["value"] for each in found])
+        return f"{mean:+.1f} points above *{other}* (interval above zero for {clear} of {len(found)} seeds)"
+
+    others = [gain(other) for other in ("student before", "teacher", "student, without physics")]
+    return f"The paper's method, in the mean over seeds: {'; '.join(others)}."
 
 
 def _in_domain(name: str, rows: dict[str, list[dict[str, Any]]]) -> str:

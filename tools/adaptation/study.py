@@ -20,21 +20,35 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
 from datetime import date
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from page import RESULTS, table, write_page
+from plan import (
+    ADAPTED_TEACHER,
+    ANALYTIC_HELD_OUT,
+    ANALYTIC_SEED,
+    BEFORE,
+    CAPTURED_SETS,
+    DETECTOR_FRAMES,
+    DETECTOR_SEED,
+    HELD_OUT_SEED,
+    ROWS,
+    TEACHER,
+    TRACED_HELD_OUT,
+    TRACED_SEED,
+    TRAINED,
+    Study,
+    check_settings,
+)
+from results import result_of
 
-from dataset.errors import ToolkitError
 from dataset.session import Session
 from s2p3 import objects
-from s2p3.config import ExperimentConfig, SelfSupervisionConfig, load
-from s2p3.evaluation import Evaluation, evaluate, find_objects
+from s2p3.evaluation import evaluate, find_objects
 from s2p3.networks.detector import Detection
 from s2p3.provenance import checked_out_commit
 from s2p3.synthesis import (
@@ -50,105 +64,8 @@ from s2p3.synthesis import (
 from s2p3.synthesis.scene import Backend
 from s2p3.training import captured_crops, self_supervise, train_detector, train_student, train_teacher
 from s2p3.training.adaptation import adapt_batch_norm
-from s2p3.training.checkpoint import CheckpointInfo, read_info, save
+from s2p3.training.checkpoint import CheckpointInfo, save
 from s2p3.training.pretrain import load_teacher
-
-TRACED_SEED, ANALYTIC_SEED, HELD_OUT_SEED = 0, 1, 2
-TRACED_HELD_OUT, ANALYTIC_HELD_OUT = 60, 300  # frames
-DETECTOR_FRAMES, DETECTOR_SEED = 1800, 3
-CAPTURED_SETS = {"captured": (1920, 100), "captured-val": (280, 101), "captured-test": (1000, 102)}
-"""Frames and seed of the set to adapt to and of those to judge by."""
-
-Change = Callable[[SelfSupervisionConfig], SelfSupervisionConfig]
-
-ADABN = SelfSupervisionConfig().adapt_batches
-TRAINED: dict[str, Change] = {
-    "student, AdaBN alone": lambda settings: replace(settings, steps=0, epochs=0, adapt_batches=ADABN),
-    "student, pose-only distillation": lambda settings: replace(
-        settings, pose_weight=1.0, mask_weight=0.0, normals_weight=0.0, physics="none"
-    ),
-    "student, without physics": lambda settings: replace(settings, physics="none"),
-    "student, DoLP physics (the paper's)": lambda settings: replace(settings, physics="dolp"),
-    "student, Stokes physics (ours)": lambda settings: replace(settings, physics="stokes"),
-}
-"""The rows that start from the pre-trained student, and how each departs from the object's settings."""
-
-BEFORE, TEACHER, ADAPTED_TEACHER = "student before", "teacher", "teacher, AdaBN alone"
-ROWS = (BEFORE, TEACHER, ADAPTED_TEACHER, *TRAINED)
-"""All rows, in the table's order."""
-
-
-@dataclass(frozen=True)
-class Study:
-    """One object's study.
-
-    Attributes:
-        name: of the object.
-        out: folder of everything the study makes.
-        seeds: each trains teacher, student and every row anew; the sets and the detector are common.
-        domain: name of the one that the training sets are drawn from.
-        traced, analytic: synthetic frames to train on, by backend.
-        judged: name of the captured set that is evaluated.
-    """
-
-    name: str
-    out: Path
-    seeds: tuple[int, ...]
-    domain: str
-    traced: int
-    analytic: int
-    judged: str
-
-    @property
-    def settings_file(self) -> Path:
-        return Path(__file__).with_name(f"{self.name}.toml")
-
-    @property
-    def detector_set(self) -> Path:
-        return self.out / "detector.h5"
-
-    @property
-    def detector(self) -> Path:
-        return self.out / "detector" / "detector.safetensors"
-
-    def set(self, name: str) -> Path:
-        return self.out / f"{name}.h5"
-
-    def found(self, name: str) -> Path:
-        """The detector's answers for a captured set: every row of every seed sees the same."""
-        return self.detector.with_name(f"{name}.npz")
-
-    def training_sets(self) -> list[Path]:
-        sets = {"traced": self.traced, "analytic": self.analytic}
-        return [self.set(name) for name, count in sets.items() if count]
-
-    def held_out(self) -> list[str]:
-        return [f"{path.stem}-held-out" for path in self.training_sets()]
-
-    def checkpoint(self, row: str, seed: int) -> Path:
-        folder = self.out / f"seed-{seed}" / row.replace(" ", "-").replace(",", "").replace("'", "")
-        kind = {BEFORE: "student", TEACHER: "teacher", ADAPTED_TEACHER: "teacher"}.get(row, "adapted")
-        return folder / f"{kind}.safetensors"
-
-    def evaluation(self, row: str, seed: int, what: str) -> Path:
-        return self.checkpoint(row, seed).with_name(f"{what}.json")
-
-    def experiment(self, seed: int) -> ExperimentConfig:
-        config = load(self.settings_file)
-        return replace(
-            config,
-            teacher=replace(config.teacher, seed=seed),
-            student=replace(config.student, seed=seed),
-            self_supervision=replace(config.self_supervision, seed=seed),
-        )
-
-    def stage(self, row: str, seed: int) -> tuple[Path, str, object]:
-        """The checkpoint of a row, and the part of its experiment that it was trained by: name and value."""
-        config, path = self.experiment(seed), self.checkpoint(row, seed)
-        if row in (TEACHER, BEFORE):
-            return path, path.stem, getattr(config, path.stem)
-        change = TRAINED.get(row, lambda settings: settings)
-        return path, "self_supervision", change(config.self_supervision)
 
 
 def make_sets(study: Study, workers: int) -> None:
@@ -170,22 +87,10 @@ def make_sets(study: Study, workers: int) -> None:
     for path, count, seed, domain, backend in makers:
         if not path.exists():
             print(f"{path.name}: {count} frames", flush=True)
+            started = time.perf_counter()
             print(synthesize(model, count, session_camera(), seed, path, workers, None, domain, backend))
-
-
-def check_settings(study: Study) -> None:
-    """Raises ToolkitError: a checkpoint in the folder was trained by settings other than those of today."""
-    stages = [study.stage(row, seed) for seed in study.seeds for row in ROWS]
-    stages.append((study.detector, "detector", study.experiment(0).detector))
-    for path, name, settings in stages:
-        if path.exists():
-            config, today = read_info(path).config, study.experiment(0)
-            shared = all(getattr(config, part) == getattr(today, part) for part in ("input", "augmentation"))
-            if not shared or config.network != today.network or getattr(config, name) != settings:
-                raise ToolkitError(
-                    f"{path}: was trained by other settings than {study.settings_file.name} now holds; "
-                    "delete it with what was made from it, or choose another --out"
-                )
+            with study.rendered.open("a", encoding="utf-8") as log:
+                log.write(f"{path.name}\t{workers}\t{time.perf_counter() - started:.0f}\n")
 
 
 def train_network(study: Study, what: str, seed: int) -> None:
@@ -288,72 +193,6 @@ def run_study(study: Study, workers: int) -> None:
     run_all(students, workers)
     run_all(adaptation, workers)
     run_all(evaluation, workers)
-
-
-def minutes_of(study: Study) -> dict[str, float]:
-    """What the trainings took, on average, a process and a thread each: from their logs."""
-
-    def seconds(log: Path) -> float:
-        """Of all sessions of a training: each counts from zero."""
-        times = [0.0, *(json.loads(line)["seconds"] for line in log.read_text(encoding="utf-8").splitlines())]
-        return sum(now - before if now > before else now for before, now in pairwise(times))
-
-    def spent(checkpoints: Iterable[Path]) -> float:
-        logs = [path.with_suffix(".log.jsonl") for path in checkpoints]
-        return round(float(np.mean([seconds(log) for log in logs])) / 60, 1)
-
-    trained = [row for row in TRAINED if row != "student, AdaBN alone"]
-    return {
-        "the detector": spent([study.detector]),
-        "a teacher": spent(study.checkpoint(TEACHER, seed) for seed in study.seeds),
-        "a student": spent(study.checkpoint(BEFORE, seed) for seed in study.seeds),
-        "a self-supervised row": spent(
-            study.checkpoint(row, seed) for seed in study.seeds for row in trained
-        ),
-    }
-
-
-def result_of(study: Study) -> dict[str, Any]:
-    """What the study found, ready for JSON."""
-
-    def figures(row: str, what: str) -> list[dict[str, Any]]:
-        found = []
-        for seed in study.seeds:
-            summary = Evaluation.load(study.evaluation(row, seed, what)).summary
-            names = (
-                "targets",
-                "missed",
-                "recall_10",
-                "recall_5",
-                "rotation_deg",
-                "translation_mm",
-                "depth_mm",
-            )
-            row_figures = {name: getattr(summary, name) for name in names}
-            commit = read_info(study.checkpoint(row, seed)).commit
-            found.append({"seed": seed, "metric": summary.metric, "commit": commit, **row_figures})
-        return found
-
-    def above(row: str, other: str) -> list[dict[str, float]]:
-        found = []
-        for seed in study.seeds:
-            runs = [Evaluation.load(study.evaluation(name, seed, study.judged)) for name in (row, other)]
-            difference = runs[0].above(runs[1])["recall_10"]
-            low, high = difference.interval
-            found.append({"seed": seed, "value": difference.value, "low": low, "high": high})
-        return found
-
-    return {
-        "judged": study.judged,
-        "minutes": minutes_of(study),
-        "rows": {row: figures(row, study.judged) for row in ROWS},
-        "in_domain": {
-            name: {row: figures(row, name) for row in (TEACHER, BEFORE)} for name in study.held_out()
-        },
-        "differences": {
-            row: {other: above(row, other) for other in ROWS if other != row} for row in ROWS[3:]
-        },
-    }
 
 
 def main() -> int:

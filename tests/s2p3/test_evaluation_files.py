@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from safetensors.torch import load_file
 
 from dataset.session import ObjectPoses, Session, write_poses, write_split
 from s2p3.cli import main
 from s2p3.evaluation.bop_results import write_bop_results
 from s2p3.evaluation.summary import FIGURES
 from s2p3.objects import ObjectModel, build
+from s2p3.training import checkpoint
 from tests.s2p3.evaluations import evaluation, missed, record
 from tests.s2p3.untrained import eager_detector_config, save_untrained
 
@@ -105,10 +107,9 @@ def test_a_checkpoint_of_another_kind_is_refused(
 def test_a_checkpoint_of_another_input_set_is_refused(
     session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    moved = Path(shutil.copy(networks["student"], tmp_path / "student.safetensors"))
-    text = networks["student"].with_suffix(".json").read_text()
-    assert "double_angle" in text
-    moved.with_suffix(".json").write_text(text.replace("double_angle", "angle"))
+    info, moved = checkpoint.read_info(networks["student"]), tmp_path / "student.safetensors"
+    config = replace(info.config, input=replace(info.config.input, aolp="angle"))
+    checkpoint.save(moved, load_file(networks["student"]), replace(info, config=config))
     line = refusal(words(session, networks | {"student": moved}), capfd)
     assert "student.safetensors: does not fit this network" in line
 

@@ -3,14 +3,18 @@
 Two presets. `paper` holds the values the S2P3 paper states (256x256 crops, Adam 1e-4 halved every 25 of 100
 epochs, batch 8 and 4, all loss weights 1, masked inputs). `fast` is our choice: what reaches a usable model
 soonest on two CPU cores. Values the paper does not state are our choice in both.
+
+A table raises ToolkitError where a number is out of range, whether it comes from a file, an option or code.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 
@@ -19,6 +23,36 @@ from dataset.errors import ToolkitError
 
 Schedule = Literal["cosine", "halving", "flat"]
 PhysicsVariant = Literal["dolp", "stokes", "aolp", "dolp-gain", "none"]
+
+
+class _Range(NamedTuple):
+    """The numbers that a field may hold, in words and as a test."""
+
+    words: str
+    holds: Callable[[float], bool]
+
+
+def _at_least(lowest: float, name: str = "") -> _Range:
+    called = f"{name} ({lowest:g})" if name else f"{lowest:g}"
+    return _Range(f"of {called} or more", lambda value: value >= lowest)
+
+
+def _between(lowest: float, highest: float) -> _Range:
+    return _Range(f"from {lowest:g} to {highest:g}", lambda value: lowest <= value <= highest)
+
+
+_NOT_NEGATIVE, _COUNT, _SHARE = _at_least(0), _at_least(1), _between(0, 1)
+_POSITIVE = _Range("above 0", lambda value: value > 0)
+_BELOW_ONE = _Range("from 0 to below 1", lambda value: 0 <= value < 1)
+_ODD = _Range("that is odd", lambda value: value > 0 and value % 2 == 1)
+
+
+def _check(table: Any, **ranges: _Range) -> None:
+    """Raises ToolkitError: a field of `table` is outside its range, or not finite."""
+    for name, (words, holds) in ranges.items():
+        value = getattr(table, name)
+        if not (math.isfinite(value) and holds(value)):
+            raise ToolkitError(f"{name} = {value:g} is out of range; give a number {words}")
 
 
 @dataclass(frozen=True)
@@ -41,6 +75,14 @@ class InputConfig:
     (PPP-Net)."""
     background: Literal["keep", "mask"] = "keep"
     """Whether polarization and prior channels outside the predicted mask are zeroed (`mask`: the paper)."""
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            zoom=_POSITIVE,
+            canonical_size=_at_least(32),  # half the smallest input: less would be enlarged beyond use
+            canonical_zoom=_at_least(self.zoom, "zoom"),
+        )
 
 
 @dataclass(frozen=True)
@@ -65,6 +107,19 @@ class AugmentationConfig:
     blur: float = 0.5
     """Probability of a 3x3 blur."""
 
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            zoom_min=_POSITIVE,
+            zoom_max=_at_least(self.zoom_min, "zoom_min"),
+            shift=_NOT_NEGATIVE,
+            rotation_deg=_between(0, 180),
+            noise=_NOT_NEGATIVE,
+            gain=_BELOW_ONE,
+            dolp=_SHARE,
+            blur=_SHARE,
+        )
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -83,6 +138,9 @@ class NetworkConfig:
     """Hidden units of the student's pose head."""
     imagenet: bool = True
     """Start the encoders from ImageNet weights (the paper)."""
+
+    def __post_init__(self) -> None:
+        _check(self, decoder_channels=_at_least(2), head_channels=_COUNT, head_hidden=_COUNT)
 
 
 @dataclass(frozen=True)
@@ -111,6 +169,19 @@ class StageConfig:
     checkpoint_every: int = 200
     """Steps between two states from which an interrupted training goes on."""
 
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            steps=_NOT_NEGATIVE,
+            epochs=_NOT_NEGATIVE,
+            batch=_COUNT,
+            learning_rate=_NOT_NEGATIVE,
+            weight_decay=_NOT_NEGATIVE,
+            clip_norm=_POSITIVE,
+            ema=_BELOW_ONE,
+            checkpoint_every=_COUNT,
+        )
+
     def steps_over(self, samples: int) -> int:
         """Optimizer steps: `steps`, or those of `epochs` passes through `samples` where that is given."""
         return max(1, self.epochs * samples // self.batch) if self.epochs else self.steps
@@ -127,8 +198,8 @@ class SupervisedConfig(StageConfig):
     """Share of the frames kept for that, where no others are named."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.holdout < 1:
-            raise ToolkitError(f"holdout {self.holdout:g} is no share below one; give 0.1, or 0 for none")
+        super().__post_init__()
+        _check(self, validations=_NOT_NEGATIVE, holdout=_BELOW_ONE)
 
 
 @dataclass(frozen=True)
@@ -141,6 +212,10 @@ class PretrainConfig(SupervisedConfig):
     warm_start: bool = False
     """Student: start the encoders from the teacher's instead of ImageNet's."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check(self, dense_weight=_NOT_NEGATIVE)
+
 
 @dataclass(frozen=True)
 class DetectorConfig(SupervisedConfig):
@@ -152,11 +227,15 @@ class DetectorConfig(SupervisedConfig):
     ema: float = 0.97
     checkpoint_every: int = 100
     level: int = 4
-    """Down-sampling of the polarization image the detector sees."""
+    """Down-sampling of the polarization image the detector sees, 1 to 32."""
     threshold: float = 0.5
     """Mask probability above which a pixel belongs to the object."""
     minimum_score: float = 0.5
     """Mean mask probability below which nothing is reported."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check(self, level=_between(1, 32), threshold=_SHARE, minimum_score=_SHARE)
 
 
 @dataclass(frozen=True)
@@ -199,6 +278,22 @@ class SelfSupervisionConfig(StageConfig):
     """Whether the student's BatchNorm statistics stay as they are while it learns, or follow the captured
     frames: those hold the object's size in the box, too, which tells its distance."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check(
+            self,
+            pose_weight=_NOT_NEGATIVE,
+            mask_weight=_NOT_NEGATIVE,
+            normals_weight=_NOT_NEGATIVE,
+            physics_weight=_NOT_NEGATIVE,
+            depth_weight=_NOT_NEGATIVE,
+            smoothing=_ODD,
+            threshold=_SHARE,
+            threshold_quantile=_SHARE,
+            teacher_decay=_BELOW_ONE,
+            adapt_batches=_NOT_NEGATIVE,
+        )
+
 
 @dataclass(frozen=True)
 class Self6DConfig(StageConfig):
@@ -223,6 +318,19 @@ class Self6DConfig(StageConfig):
     """Of LPIPS."""
     lpips_weights: str = ""
     """File of LPIPS' weights, see `s2p3.networks.perceptual`; without one the term is left out."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check(
+            self,
+            pose_weight=_NOT_NEGATIVE,
+            mask_weight=_NOT_NEGATIVE,
+            chamfer_weight=_NOT_NEGATIVE,
+            chamfer_limit_m=_POSITIVE,
+            colour_weight=_NOT_NEGATIVE,
+            structure_weight=_NOT_NEGATIVE,
+            perceptual_weight=_NOT_NEGATIVE,
+        )
 
 
 _OptionalName = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(optional)")]

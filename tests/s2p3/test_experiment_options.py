@@ -65,6 +65,8 @@ def test_a_students_own_experiment_is_the_default_of_its_adaptation(tmp_path: Pa
     ("more", "said"),
     [
         (["--config.input.size", "100"], "input.size 100 does not fit"),
+        (["--config.student.batch", "0"], "s2p3: batch = 0 is out of range; give a number of 1 or more\n"),
+        (["--config.student.learning-rate", "nan"], "s2p3: learning_rate = nan is out of range"),
         (["--config", "nothing.toml"], "nothing.toml: no such file"),
     ],
 )

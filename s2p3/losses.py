@@ -15,6 +15,7 @@ from torch import Tensor
 
 from s2p3 import physics
 from s2p3.config import PhysicsVariant
+from s2p3.inputs import degree_of_polarization
 
 CLOUD_POINTS = 256
 """Points a depth map is thinned out to before clouds are compared (our choice)."""
@@ -222,20 +223,15 @@ def back_project(depth: Tensor, mask: Tensor, K: Tensor, count: int) -> Tensor:
     return torch.stack(rows)
 
 
-def _dolp(stokes: Tensor) -> Tensor:
-    s0, s1, s2 = stokes.unbind(1)
-    return (torch.hypot(s1, s2) / s0.clamp_min(_FLOOR)).clamp(max=1)
-
-
 def _dolp_error(stokes: Tensor, normals: Tensor, rays: Tensor, weight: Tensor, index: float) -> Tensor:
     del weight
-    dolp = _dolp(stokes)
+    dolp = degree_of_polarization(stokes)
     diffuse, specular = physics.analytic_dolp(normals, rays, index)
     return torch.minimum((dolp - diffuse).abs(), (dolp - specular).abs())
 
 
 def _gain_error(stokes: Tensor, normals: Tensor, rays: Tensor, weight: Tensor, index: float) -> Tensor:
-    dolp = _dolp(stokes)
+    dolp = degree_of_polarization(stokes)
     diffuse, specular = physics.analytic_dolp(normals, rays, index)
     fitted = (dolp * specular * weight).sum((1, 2)) / (specular.square() * weight).sum((1, 2)).clamp_min(1e-6)
     gain = fitted.clamp(*_GAIN).detach()[:, None, None]  # detached: the pose must not explain itself away

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from s2p3.inputs import degree_of_polarization, normalize_exposure
 from s2p3.networks.lite0 import Lite0, load_imagenet
-from s2p3.networks.pose_head import conv_norm_leaky
+from s2p3.networks.pose_head import conv_norm_leaky, doubled
 
 CELL = 2
 """Side of an output cell in pixels of the down-sampled image."""
@@ -68,9 +68,9 @@ class Detector(nn.Module):
         and distances (B, 4, h/2, w/2) to the box's left, top, right and bottom, in pixels of the down-sampled
         image."""
         x, (skip2, skip4, skip8) = self.trunk(self.normalize(image))
-        x = self.decode8(torch.cat([_double(x), skip8], dim=1))
-        x = self.decode4(torch.cat([_double(x), skip4], dim=1))
-        x = self.output(self.decode2(torch.cat([_double(x), skip2], dim=1)))
+        x = self.decode8(torch.cat([doubled(x), skip8], dim=1))
+        x = self.decode4(torch.cat([doubled(x), skip4], dim=1))
+        x = self.output(self.decode2(torch.cat([doubled(x), skip2], dim=1)))
         return x[:, : self.classes], F.softplus(x[:, self.classes :]) * _DISTANCE_UNIT
 
 
@@ -133,10 +133,6 @@ def detect(
     mask[: part.shape[0], : part.shape[1]] = part
     box = np.array([left, top, max(right - left, 1.0), max(bottom - top, 1.0)])
     return Detection(box, mask, score)
-
-
-def _double(x: Tensor) -> Tensor:
-    return F.interpolate(x, scale_factor=2.0, mode="nearest")
 
 
 def _largest_blob(probability: NDArray[np.float32], threshold: float) -> NDArray[np.bool_] | None:

@@ -58,6 +58,11 @@ def conv_norm_leaky(inputs: int, outputs: int, kernel: int = 3, stride: int = 1)
     ]
 
 
+def doubled(x: Tensor) -> Tensor:
+    """(B, C, H, W) -> (B, C, 2 H, 2 W), every value four times, as decoders do."""
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
 def coordinate_channels(like: Tensor) -> Tensor:
     """(B, 2, H, W): x and y of every pixel of `like` (B, C, H, W), from -1 to 1 across the crop."""
     batch, _, height, width = like.shape

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from s2p3.networks.encoder import DualEncoder
-from s2p3.networks.pose_head import PoseHead, conv_norm_leaky, coordinate_channels
+from s2p3.networks.pose_head import PoseHead, conv_norm_leaky, coordinate_channels, doubled
 
 MAP_STRIDE = 4
 _MAP_CHANNELS = 7
@@ -81,17 +81,13 @@ class Teacher(nn.Module):
         features, (skip4, skip8, skip16) = self.encoder(polarization, priors)
         x = self.reduce(features)
         if self.encoder.total_stride == 32:
-            x = _double(x)
+            x = doubled(x)
         x = self.decode16(torch.cat([x, self.skip16(skip16)], dim=1))
-        x = self.decode8(torch.cat([_double(x), skip8], dim=1))
-        x = self.decode4(torch.cat([_double(x), skip4], dim=1))
+        x = self.decode8(torch.cat([doubled(x), skip8], dim=1))
+        x = self.decode4(torch.cat([doubled(x), skip4], dim=1))
         maps = self.maps(x)
         mask_logits, coordinates = maps[:, :1], maps[:, 4:7]
         normals = F.normalize(maps[:, 1:4], dim=1)
         inside = mask_logits.sigmoid()
         seen = torch.cat([coordinates, normals, coordinate_channels(maps)], dim=1) * inside
         return TeacherOutput(self.pose(torch.cat([inside, seen], dim=1)), mask_logits, normals, coordinates)
-
-
-def _double(x: Tensor) -> Tensor:
-    return F.interpolate(x, scale_factor=2.0, mode="nearest")

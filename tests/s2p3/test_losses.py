@@ -132,6 +132,15 @@ def test_physics_loss_takes_the_nearer_of_the_two_by_hand() -> None:
     assert nothing == losses.physics_loss("none", stokes, normals, rays, mask, 1.5) == 0
 
 
+def test_a_pixel_without_light_shows_no_polarization() -> None:
+    """To the loss, as to the networks."""
+    normals, rays = tilted(0.8)
+    stokes = torch.tensor([5e-4, 4e-4, 0.0], dtype=torch.float64).view(1, 3, 1, 1)
+    mask = torch.ones(1, 1, 1, 1, dtype=torch.float64)
+    loss = losses.physics_loss("dolp", stokes, normals, rays, mask, 1.5)
+    assert loss == pytest.approx(min(float(rho) for rho in physics.analytic_dolp(normals, rays, 1.5)))
+
+
 def test_stokes_physics_by_hand() -> None:
     """Seen along the axis, the azimuth of (.6, .8 up) is 53.1 degrees: 2 phi has cosine -.28 and sine .96."""
     normals, rays = tilted(0.8)

@@ -39,7 +39,8 @@ def evaluate(
         out: JSON file for all figures and a record of every target; beside it come the same name .html, the
             report, and .csv, the estimates as the BOP challenge takes them.
         beside: earlier evaluations (their JSON files) to put into the report; those of the same targets are
-            compared, with paired intervals.
+            compared, with paired intervals. Each is called by its file's name, with folders where names are
+            alike.
         scene_id: of the session in the BOP data set; objects are numbered as its export does.
         json: print the summary as JSON.
     """
@@ -47,17 +48,20 @@ def evaluate(
 
     from s2p3.evaluation import Evaluation
     from s2p3.evaluation.evaluate import finite
-    from s2p3.evaluation.files import write_files
+    from s2p3.evaluation.files import check_out, told_apart, write_files
     from s2p3.learning import evaluate_split
     from s2p3.objects import named_object
 
     at_least(0, scene_id=scene_id)
     model = named_object(object, mesh)
-    others = {path.stem: Evaluation.load(path) for path in beside}
+    if out is not None:
+        check_out(out)
+    names = told_apart([*beside, *([] if out is None else [out])])
+    others = {name: Evaluation.load(path) for name, path in zip(names, beside, strict=False)}
     result = evaluate_split(session, split, model, {"network": network}, detector)["network"]
     against = {name: result.above(other) for name, other in others.items() if result.paired_with(other)}
     if out is not None:
-        for path in write_files(out, session, model, result, others, scene_id):
+        for path in write_files(out, names[-1], session, model, result, others, scene_id):
             say(f"wrote {path}")
     summary = asdict(result.summary)
     if json:

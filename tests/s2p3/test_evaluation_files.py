@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from dataset.session import ObjectPoses, Session, write_poses, write_split
 from s2p3.cli import main
 from s2p3.evaluation.bop_results import write_bop_results
+from s2p3.evaluation.files import told_apart
 from s2p3.evaluation.summary import FIGURES
 from s2p3.objects import ObjectModel, build
 from s2p3.training import checkpoint
@@ -150,6 +151,56 @@ def test_what_cannot_stand_beside_is_refused(
     (tmp_path / "not.json").write_text("{}")
     line = refusal([*words(session, networks), "--beside", str(tmp_path / "not.json")], capfd)
     assert "is no saved evaluation" in line
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        ([], []),
+        (["results/after.json"], ["after"]),
+        (["row-1/test.json", "row-2/test.json", "before.json"], ["row-1/test", "row-2/test", "before"]),
+        (["a/1/test.json", "b/1/test.json", "2/test.json"], ["a/1/test", "b/1/test", "2/test"]),
+    ],
+)
+def test_evaluations_are_called_by_the_shortest_end_of_the_path_that_tells_them_apart(
+    paths: list[str], names: list[str]
+) -> None:
+    assert told_apart([Path(path) for path in paths]) == names
+
+
+def test_evaluations_of_the_same_name_stand_beside_each_other(
+    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    outs = [tmp_path / row / "test.json" for row in ("row-1", "row-2", "row-3")]
+    for kind, out in zip(("teacher", "student"), outs, strict=False):
+        assert main([*words(session, networks, kind), "--out", str(out)]) == 0
+    capfd.readouterr()
+    beside = ["--beside", str(outs[0]), str(outs[1])]
+    assert main([*words(session, networks), *beside, "--out", str(outs[2]), "--json"]) == 0
+    above = json.loads(capfd.readouterr().out)["above"]
+    assert list(above) == ["row-1/test", "row-2/test"]
+    moved = {name: found["translation_mm"]["value"] for name, found in above.items()}
+    assert moved["row-2/test"] == 0 != moved["row-1/test"]
+    page = outs[2].with_suffix(".html").read_text()
+    assert all(f"row-{row}/test" in page for row in (1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("out", "beside", "said"),
+    [
+        ("page.html", [], "name it"),
+        (".", [], "is a folder"),
+        ("new.json", ["old.json", "./old.json"], "named twice"),
+        ("old.json", ["old.json"], "named twice"),
+    ],
+)
+def test_names_that_cannot_be_are_refused_before_anything_is_read(
+    out: str, beside: list[str], said: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    nothing = {kind: tmp_path / f"{kind}.safetensors" for kind in ("student", "detector")}
+    arguments = [*words(tmp_path / "no.h5", nothing), "--out", str(tmp_path / out)]
+    earlier = ["--beside", *(f"{tmp_path}/{name}" for name in beside)] if beside else []
+    assert said in refusal([*arguments, *earlier], capfd)
 
 
 def test_nothing_detected_is_recall_zero_not_an_error(

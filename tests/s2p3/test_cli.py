@@ -373,6 +373,15 @@ def test_dataset_split(cup_copy: Path, by: str, capfd: pytest.CaptureFixture[str
     assert sorted(np.concatenate(list(splits.values()))) == list(range(8))
 
 
+def test_the_package_runs_as_the_command_line_does(cup_session: Path) -> None:
+    words = [sys.executable, "-m", "s2p3", "dataset", "info"]
+    done = subprocess.run([*words, str(cup_session), "--json"], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, json.loads(done.stdout)["frames"]) == (0, 8)
+    done = subprocess.run([*words, "no.h5"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.startswith("s2p3: no.h5")
+
+
 def test_a_reader_that_leaves_early_is_no_error(cup_session: Path) -> None:
     info = f"{sys.executable} -m s2p3.cli dataset info {cup_session}"
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}

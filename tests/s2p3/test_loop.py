@@ -19,8 +19,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
+from s2p3 import config as presets
+from s2p3.config import AugmentationConfig
 from s2p3.networks.teacher import TeacherOutput
+from s2p3.objects import ObjectModel
+from s2p3.training import train_student
 from s2p3.training.loop import Forward, Losses, Score, Trained, optimize, rate_factor
+from s2p3.training.pretrain import load_student
 from s2p3.training.processes import Processes
 from tests.s2p3.linear_run import SETTINGS, Numbers, Squares, network, run
 
@@ -41,14 +46,19 @@ def free_port() -> int:
         return port
 
 
+def launch(*words: object) -> None:
+    """Runs a Python script or module by two processes that train together."""
+    together = ["-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(free_port())]
+    command = [sys.executable, *together, *map(str, words)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=300, capture_output=True)
+
+
 def test_two_processes_train_as_one_does(tmp_path: Path) -> None:
     """They see different rows, and end with equal weights: those that one process gives whole batches."""
     alone, together = tmp_path / "alone", tmp_path / "together"
     together.mkdir()
-    launch = ["-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(free_port())]
-    words = [sys.executable, *launch, str(ROOT / "tests/s2p3/linear_run.py"), str(together)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    subprocess.run(words, cwd=ROOT, env=environment, check=True, timeout=300, capture_output=True)
+    launch(ROOT / "tests/s2p3/linear_run.py", together)
     run(alone)
     one, first, second = (
         json.loads((folder / f"seen-{rank}.json").read_text())
@@ -66,6 +76,28 @@ def test_two_processes_train_as_one_does(tmp_path: Path) -> None:
         assert torch.equal(others[0][name], others[1][name])
         torch.testing.assert_close(others[0][name], value)
         assert (value - network().state_dict()[name]).abs().max() > 0.05
+
+
+def test_two_processes_train_a_student_together(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
+    """By the command line: the first one scores and writes. Its losses are of its half of the rows, and
+    BatchNorm is each one's own, so they are like those of one process, not equal."""
+    base = presets.quick()
+    few = replace(base.student, steps=2, batch=6, validations=1, holdout=0.25)
+    config = replace(base, student=few, augmentation=AugmentationConfig(1.4, 1.4, 0, 0, 0, 0, 0, 0))
+    presets.save(config, tmp_path / "experiment.toml")
+    words = ["train", "student", cup_session, "--object", "cup", "--config", tmp_path / "experiment.toml"]
+    together, alone = tmp_path / "together", tmp_path / "alone"
+    launch("-m", "s2p3", *words, "--workers", 0, "--out", together)
+    train_student([cup_session], cup, config, alone, cache=tmp_path, on_step=lambda *_: None)
+    files = [{path.name for path in folder.iterdir()} for folder in (together, alone)]
+    assert files[0] == files[1] >= {"student.safetensors", "student.json", "student.log.jsonl"}
+    (line,), (expected,) = (
+        [json.loads(text) for text in (folder / "student.log.jsonl").read_text().splitlines()]
+        for folder in (together, alone)
+    )
+    assert line.keys() == expected.keys() >= {"add_recall_10"}
+    assert line["step"] == load_student(together / "student.safetensors")[1].step == 2
+    assert line["total"] == pytest.approx(expected["total"], rel=0.2)
 
 
 @pytest.mark.parametrize("best", [1, 2, 3])

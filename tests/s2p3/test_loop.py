@@ -51,7 +51,12 @@ def launch(*words: object) -> None:
     together = ["-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(free_port())]
     command = [sys.executable, *together, *map(str, words)]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=300, capture_output=True)
+    process = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE)
+    try:
+        errors = process.communicate(timeout=300)[1]
+    finally:
+        process.terminate()  # so that it ends its processes, which a kill would leave behind
+    assert process.returncode == 0, errors.decode()
 
 
 def test_two_processes_train_as_one_does(tmp_path: Path) -> None:

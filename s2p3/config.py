@@ -10,49 +10,18 @@ A table raises ToolkitError where a number is out of range, whether it comes fro
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import tyro
 
 from acquisition import typed_toml
 from dataset.errors import ToolkitError
+from s2p3.ranges import BELOW_ONE, COUNT, NOT_NEGATIVE, ODD, POSITIVE, SHARE, at_least, between, check
 
 Schedule = Literal["cosine", "halving", "flat"]
 PhysicsVariant = Literal["dolp", "stokes", "aolp", "dolp-gain", "none"]
-
-
-class _Range(NamedTuple):
-    """The numbers that a field may hold, in words and as a test."""
-
-    words: str
-    holds: Callable[[float], bool]
-
-
-def _at_least(lowest: float, name: str = "") -> _Range:
-    called = f"{name} ({lowest:g})" if name else f"{lowest:g}"
-    return _Range(f"of {called} or more", lambda value: value >= lowest)
-
-
-def _between(lowest: float, highest: float) -> _Range:
-    return _Range(f"from {lowest:g} to {highest:g}", lambda value: lowest <= value <= highest)
-
-
-_NOT_NEGATIVE, _COUNT, _SHARE = _at_least(0), _at_least(1), _between(0, 1)
-_POSITIVE = _Range("above 0", lambda value: value > 0)
-_BELOW_ONE = _Range("from 0 to below 1", lambda value: 0 <= value < 1)
-_ODD = _Range("that is odd", lambda value: value > 0 and value % 2 == 1)
-
-
-def _check(table: Any, **ranges: _Range) -> None:
-    """Raises ToolkitError: a field of `table` is outside its range, or not finite."""
-    for name, (words, holds) in ranges.items():
-        value = getattr(table, name)
-        if not (math.isfinite(value) and holds(value)):
-            raise ToolkitError(f"{name} = {value:g} is out of range; give a number {words}")
 
 
 @dataclass(frozen=True)
@@ -77,11 +46,11 @@ class InputConfig:
     """Whether polarization and prior channels outside the predicted mask are zeroed (`mask`: the paper)."""
 
     def __post_init__(self) -> None:
-        _check(
+        check(
             self,
-            zoom=_POSITIVE,
-            canonical_size=_at_least(32),  # half the smallest input: less would be enlarged beyond use
-            canonical_zoom=_at_least(self.zoom, "zoom"),
+            zoom=POSITIVE,
+            canonical_size=at_least(32),  # half the smallest input: less would be enlarged beyond use
+            canonical_zoom=at_least(self.zoom, "zoom"),
         )
 
 
@@ -108,16 +77,16 @@ class AugmentationConfig:
     """Probability of a 3x3 blur."""
 
     def __post_init__(self) -> None:
-        _check(
+        check(
             self,
-            zoom_min=_POSITIVE,
-            zoom_max=_at_least(self.zoom_min, "zoom_min"),
-            shift=_NOT_NEGATIVE,
-            rotation_deg=_between(0, 180),
-            noise=_NOT_NEGATIVE,
-            gain=_BELOW_ONE,
-            dolp=_SHARE,
-            blur=_SHARE,
+            zoom_min=POSITIVE,
+            zoom_max=at_least(self.zoom_min, "zoom_min"),
+            shift=NOT_NEGATIVE,
+            rotation_deg=between(0, 180),
+            noise=NOT_NEGATIVE,
+            gain=BELOW_ONE,
+            dolp=SHARE,
+            blur=SHARE,
         )
 
 
@@ -140,7 +109,7 @@ class NetworkConfig:
     """Start the encoders from ImageNet weights (the paper)."""
 
     def __post_init__(self) -> None:
-        _check(self, decoder_channels=_at_least(2), head_channels=_COUNT, head_hidden=_COUNT)
+        check(self, decoder_channels=at_least(2), head_channels=COUNT, head_hidden=COUNT)
 
 
 @dataclass(frozen=True)
@@ -170,16 +139,16 @@ class StageConfig:
     """Steps between two states from which an interrupted training goes on."""
 
     def __post_init__(self) -> None:
-        _check(
+        check(
             self,
-            steps=_NOT_NEGATIVE,
-            epochs=_NOT_NEGATIVE,
-            batch=_COUNT,
-            learning_rate=_NOT_NEGATIVE,
-            weight_decay=_NOT_NEGATIVE,
-            clip_norm=_POSITIVE,
-            ema=_BELOW_ONE,
-            checkpoint_every=_COUNT,
+            steps=NOT_NEGATIVE,
+            epochs=NOT_NEGATIVE,
+            batch=COUNT,
+            learning_rate=NOT_NEGATIVE,
+            weight_decay=NOT_NEGATIVE,
+            clip_norm=POSITIVE,
+            ema=BELOW_ONE,
+            checkpoint_every=COUNT,
         )
 
     def steps_over(self, samples: int) -> int:
@@ -199,7 +168,7 @@ class SupervisedConfig(StageConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check(self, validations=_NOT_NEGATIVE, holdout=_BELOW_ONE)
+        check(self, validations=NOT_NEGATIVE, holdout=BELOW_ONE)
 
 
 @dataclass(frozen=True)
@@ -214,7 +183,7 @@ class PretrainConfig(SupervisedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check(self, dense_weight=_NOT_NEGATIVE)
+        check(self, dense_weight=NOT_NEGATIVE)
 
 
 @dataclass(frozen=True)
@@ -235,7 +204,7 @@ class DetectorConfig(SupervisedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check(self, level=_between(1, 32), threshold=_SHARE, minimum_score=_SHARE)
+        check(self, level=between(1, 32), threshold=SHARE, minimum_score=SHARE)
 
 
 @dataclass(frozen=True)
@@ -280,18 +249,18 @@ class SelfSupervisionConfig(StageConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check(
+        check(
             self,
-            pose_weight=_NOT_NEGATIVE,
-            mask_weight=_NOT_NEGATIVE,
-            normals_weight=_NOT_NEGATIVE,
-            physics_weight=_NOT_NEGATIVE,
-            depth_weight=_NOT_NEGATIVE,
-            smoothing=_ODD,
-            threshold=_SHARE,
-            threshold_quantile=_SHARE,
-            teacher_decay=_BELOW_ONE,
-            adapt_batches=_NOT_NEGATIVE,
+            pose_weight=NOT_NEGATIVE,
+            mask_weight=NOT_NEGATIVE,
+            normals_weight=NOT_NEGATIVE,
+            physics_weight=NOT_NEGATIVE,
+            depth_weight=NOT_NEGATIVE,
+            smoothing=ODD,
+            threshold=SHARE,
+            threshold_quantile=SHARE,
+            teacher_decay=BELOW_ONE,
+            adapt_batches=NOT_NEGATIVE,
         )
 
 
@@ -321,15 +290,15 @@ class Self6DConfig(StageConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check(
+        check(
             self,
-            pose_weight=_NOT_NEGATIVE,
-            mask_weight=_NOT_NEGATIVE,
-            chamfer_weight=_NOT_NEGATIVE,
-            chamfer_limit_m=_POSITIVE,
-            colour_weight=_NOT_NEGATIVE,
-            structure_weight=_NOT_NEGATIVE,
-            perceptual_weight=_NOT_NEGATIVE,
+            pose_weight=NOT_NEGATIVE,
+            mask_weight=NOT_NEGATIVE,
+            chamfer_weight=NOT_NEGATIVE,
+            chamfer_limit_m=POSITIVE,
+            colour_weight=NOT_NEGATIVE,
+            structure_weight=NOT_NEGATIVE,
+            perceptual_weight=NOT_NEGATIVE,
         )
 
 

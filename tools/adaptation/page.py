@@ -127,7 +127,7 @@ def _summary(differences: dict[str, dict[str, list[dict[str, float]]]]) -> str:
         found = differences[METHOD][other]
         clear = sum(each["low"] > 0 for each in found)
         mean = np.mean([each["value"] for each in found])
-        return f"{mean:+.1f} points above *{other}* (interval above zero for {clear} of {len(found)} seeds)"
+        return f"{mean:+.1f} points against *{other}* (interval above zero for {clear} of {len(found)} seeds)"
 
     others = [gain(other) for other in ("student before", "teacher", "student, without physics")]
     return f"The paper's method, in the mean over seeds: {'; '.join(others)}."

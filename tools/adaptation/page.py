@@ -67,7 +67,7 @@ def table(result: dict[str, Any]) -> str:
             "",
             "| | teacher | student |",
             "|---|---|---|",
-            *(_in_domain(name, rows) for name, rows in result["in_domain"].items()),
+            *_in_domain(result["in_domain"]),
             "",
         ]
     )
@@ -133,9 +133,25 @@ def _summary(differences: dict[str, dict[str, list[dict[str, float]]]]) -> str:
     return f"The paper's method, in the mean over seeds: {'; '.join(others)}."
 
 
-def _in_domain(name: str, rows: dict[str, list[dict[str, Any]]]) -> str:
-    teacher, student = rows["teacher"], rows["student before"]
-    return f"| {name}, {teacher[0]['targets']} targets | {_by_seed(teacher)} | {_by_seed(student)} |"
+def _in_domain(sets: dict[str, dict[str, list[dict[str, Any]]]]) -> list[str]:
+    """Each held-out set, and where there are two, both together."""
+    networks = ("teacher", "student before")
+    found = {name: [rows[row] for row in networks] for name, rows in sets.items()}
+    if len(sets) > 1:
+        found["together"] = [_pooled(*(rows[row] for rows in sets.values())) for row in networks]
+    return [
+        f"| {name}, {rows[0][0]['targets']} targets | {' | '.join(map(_by_seed, rows))} |"
+        for name, rows in found.items()
+    ]
+
+
+def _pooled(*sets: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """By seed, the recall over the targets of all sets."""
+    targets = [figures[0]["targets"] for figures in sets]
+    recalls = [[each["recall_10"] for each in figures] for figures in sets]
+    return [
+        {"targets": sum(targets), "recall_10": recall} for recall in np.average(recalls, 0, weights=targets)
+    ]
 
 
 def _by_seed(figures: list[dict[str, Any]]) -> str:

@@ -211,7 +211,7 @@ def comparison_section(name: str, evaluation: Evaluation, others: Mapping[str, E
         blocks.append(html.table(head, rows))
     lead = (
         "Every run; and differences on the same targets, with paired 95 % bootstrap intervals: "
-        "one that excludes zero is not by chance."
+        "one that excludes zero is unlikely to be chance."
     )
     return html.section("Beside others", lead, *blocks)
 

@@ -75,7 +75,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Difference:
-    """How much one run is above another on the same targets; significant where the interval excludes zero."""
+    """How much one run is above another on the same targets, with the paired 95 % interval."""
 
     value: float
     interval: Interval

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dataset.errors import ToolkitWarning
+from s2p3.config import PhysicsVariant
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, render
 from s2p3.synthesis.informativeness import Informativeness, measure
@@ -53,15 +54,16 @@ def captured_signal(
     return _mean(_seen(chosen, drawn.normals, drawn.mask), model)
 
 
-def objection(figures: Informativeness) -> str | None:
-    """Why polarization says nothing here; None where it does."""
+def objection(figures: Informativeness, physics: PhysicsVariant = "dolp") -> str | None:
+    """Why polarization says nothing here; None where it does. The DoLP matters to a variant of L_physics that
+    compares it alone."""
     if not figures.images:
         return "no crop shows enough of the object to measure what its polarization says"
     residual, chance = figures.dolp_residual, figures.dolp_residual_shuffled
-    if residual >= _HARDLY_LESS * chance:
+    if physics in ("dolp", "dolp-gain") and residual >= _HARDLY_LESS * chance:
         return (
             f"L_physics cannot help here: min |rho - rho_hat| is {residual:.3f} at the object's normals and "
-            f'{chance:.3f} at shuffled ones; try physics = "stokes", or physics_weight = 0'
+            f'{chance:.3f} at shuffled ones; try physics = "stokes", or "none"'
         )
     if figures.prior_error_deg >= _HARDLY_LESS * figures.chance_error_deg:
         return (
@@ -71,14 +73,14 @@ def objection(figures: Informativeness) -> str | None:
     return None
 
 
-def report_signal(figures: Informativeness, beside: Path) -> None:
-    """Keeps the figures as NAME.signal.json beside a checkpoint to be, and warns where they say nothing. Of
-    several processes that train together the first one does."""
+def report_signal(figures: Informativeness, beside: Path, physics: PhysicsVariant) -> None:
+    """Keeps the figures as NAME.signal.json beside a checkpoint to be, and warns where they say nothing to a
+    training with this variant of L_physics. Of several processes that train together the first one does."""
     if int(os.environ.get("RANK", "0")):
         return
     beside.parent.mkdir(parents=True, exist_ok=True)
     beside.with_suffix(".signal.json").write_text(figures.to_json() + "\n", encoding="utf-8")
-    problem = objection(figures)
+    problem = objection(figures, physics)
     if problem is not None:
         warnings.warn(f"{beside.stem}: {problem}", ToolkitWarning, stacklevel=2)
 

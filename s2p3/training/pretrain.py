@@ -125,7 +125,9 @@ class Pretraining:
     ) -> Path:
         """Optimizes `network` and writes the checkpoint `path`, which is returned."""
         examples, index = self.examples, self.model.refractive_index
-        report_signal(labelled_signal(examples.source, examples.rows, self.model), path)
+        if self.config.input.modality == "polarization":
+            signal = labelled_signal(examples.source, examples.rows, self.model)
+            report_signal(signal, path, self.config.self_supervision.physics)
         data = LabelledData(examples.source, examples.rows, index, self.config)
         score = None
         if examples.held_out is not None:

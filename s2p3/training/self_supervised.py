@@ -75,7 +75,7 @@ def self_supervise(
             adapt_batch_norm(pair.teacher, crops, model.refractive_index, pair.config, settings)
     mesh = RenderMesh.from_mesh(model.mesh)
     labels = make_labels(pair.teacher, crops, model, mesh, pair.config)
-    report_signal(captured_signal(crops, labels.rotation, labels.translation, model), path)
+    report_signal(captured_signal(crops, labels.rotation, labels.translation, model), path, settings.physics)
     if settings.freeze_norms:
         freeze_norms(pair.student)
     set_momentum(pair.student, _BATCH_NORM_MOMENTUM)

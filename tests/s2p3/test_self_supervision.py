@@ -22,7 +22,7 @@ from dataset.session import Session, mask_box
 from dataset.session.edit import write_depth
 from s2p3 import config as presets
 from s2p3 import losses
-from s2p3.config import ExperimentConfig
+from s2p3.config import ExperimentConfig, PhysicsVariant
 from s2p3.inputs import View
 from s2p3.networks.build import build_student, build_teacher
 from s2p3.networks.detector import Detection
@@ -319,13 +319,24 @@ def test_unpolarized_light_is_warned_about(cup_session: Path, cup: ObjectModel, 
     faint[:, 1:] = (0.02 * faint[:, :1] * noise).to(faint.dtype)
     figures = labelled_signal(dataclasses.replace(crops, stokes=faint), torch.arange(8), cup)
     with pytest.warns(ToolkitWarning, match="teacher: L_physics cannot help here"):
-        report_signal(figures, tmp_path / "teacher.safetensors")
+        report_signal(figures, tmp_path / "teacher.safetensors", "dolp")
     stored = (tmp_path / "teacher.signal.json").read_text()
     assert Informativeness.from_json(stored) == figures
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        report_signal(labelled_signal(crops, torch.arange(8), cup), tmp_path / "student.safetensors")
+        report_signal(labelled_signal(crops, torch.arange(8), cup), tmp_path / "student.safetensors", "dolp")
     assert objection(Informativeness.mean([])) is not None
+
+
+@pytest.mark.parametrize("physics", ["stokes", "aolp", "none"])
+def test_only_a_loss_on_dolp_alone_is_said_to_be_blind(
+    cup_session: Path, cup: ObjectModel, physics: PhysicsVariant
+) -> None:
+    crops = labelled_crops([cup_session], cup, tiny().input, on_step=silent)
+    figures = labelled_signal(crops, torch.arange(8), cup)
+    diluted = dataclasses.replace(figures, dolp_residual=figures.dolp_residual_shuffled)
+    assert "L_physics" in str(objection(diluted))
+    assert objection(diluted, physics) is None
 
 
 def test_the_physics_sees_what_was_measured_not_what_was_augmented(cup_session: Path) -> None:

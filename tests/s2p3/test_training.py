@@ -154,6 +154,7 @@ def test_poses_that_look_the_same_have_one_target(axis: NDArray[np.float64] | No
 
 
 def test_teacher_and_student_learn(trained: Path) -> None:
+    assert (trained / "student.signal.json").exists()
     for name in ("teacher", "student"):
         log = log_of(trained / f"{name}.log.jsonl")
         assert [line["step"] for line in log] == [10, 12, 20, 24]

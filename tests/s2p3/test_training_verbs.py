@@ -206,6 +206,7 @@ def test_a_baseline_is_trained_and_predicts(
     assert main([*words, "--config.input.modality", modality]) == 0
     trained = tmp_path / "student.safetensors"
     assert read_info(trained, "student", "cup").config.input.modality == modality
+    assert not trained.with_suffix(".signal.json").exists()  # it sees no polarization
     capfd.readouterr()
     chosen = ["--network", str(trained), "--detector", str(networks["detector"]), "--count", "1"]
     assert main(["predict", str(with_depth), "--object", "cup", *chosen]) == 0

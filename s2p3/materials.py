@@ -11,6 +11,7 @@
     turns = [[1, 0, 0, 180]]     # single turns: a direction through the origin, and degrees
 
 Everything but the kind and the index may be left out; synthesis then draws colour and roughness at random.
+What follows from the turns, such as the way back, is found by itself.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ import numpy as np
 
 from acquisition import typed_toml
 from dataset import SE3, ToolkitError
-from s2p3.symmetry import Symmetry
+from s2p3.symmetry import LARGEST_GROUP, Symmetry, closed
 
 Kind = Literal["plastic", "metal", "glass"]
 
+_AS_WRITTEN = 0.01  # turns are rounded to a few digits
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # ITU-R BT.709
 
 
@@ -43,15 +45,23 @@ class SymmetryTable:
                 raise ToolkitError(
                     f"symmetry: {list(direction)} is no direction; give three numbers, not all 0"
                 )
+        if not len(self.turns) <= len(self._group()) < LARGEST_GROUP:
+            raise ToolkitError(
+                "symmetry: these turns and their products are not a few that lie apart; give each turn once, "
+                'by a whole fraction of 360 degrees, or declare an "axis"'
+            )
 
     def symmetry(self) -> Symmetry:
         """As rigid motions."""
+        axis = None if self.axis is None else _unit(self.axis)
+        return Symmetry(np.reshape([turn.as_matrix() for turn in self._group()], (-1, 4, 4)), axis)
+
+    def _group(self) -> list[SE3]:
         turns = [
-            SE3.from_rotvec(np.radians(angle) * _unit(direction), np.zeros(3)).as_matrix()
+            SE3.from_rotvec(np.radians(angle) * _unit(direction), np.zeros(3))
             for *direction, angle in self.turns
         ]
-        axis = None if self.axis is None else _unit(self.axis)
-        return Symmetry(np.reshape(turns, (-1, 4, 4)), axis)
+        return closed(turns, _AS_WRITTEN)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ S2P3 paper's table of refractive indices; the shapes themselves are our own (see
 from __future__ import annotations
 
 import hashlib
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
 from dataset import SE3, ToolkitError
+from dataset.errors import ToolkitWarning
 from dataset.session import ObjectPoses, ObjectRecord, Session
 from s2p3 import object_meshes
 from s2p3.materials import Kind, Material, load_material
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 SAME_SIZE = 0.01
 """Share of the diameter by which two meshes of one object may differ: one may be simplified."""
 
+_SAME_INDEX = 0.005  # finer than anybody knows one
 _LARGEST_M, _SMALLEST_M = 2.0, 0.005
 _PROPOSAL_POINTS = 150_000
 
@@ -195,16 +198,30 @@ def poses_of(session: Session, model: ObjectModel) -> ObjectPoses:
     Raises:
         SessionError: it was not annotated.
         ToolkitError: it was annotated with a mesh of another size, or placed otherwise in its frame, so that
-            its poses are not this object's.
+            its poses are not this object's; or the session knows a symmetry that the object lacks.
+
+    Warns (ToolkitWarning) where the session has another refractive index.
     """
-    poses = session.object_poses(model.name)
-    vertices = session.object(model.name).vertices
-    theirs, ours = (np.stack([v.min(axis=0), v.max(axis=0)]) for v in (vertices, model.vertices))
+    poses, record = session.object_poses(model.name), session.object(model.name)
+    theirs, ours = (np.stack([v.min(axis=0), v.max(axis=0)]) for v in (record.vertices, model.vertices))
     apart = float(np.abs(theirs - ours).max())
     if apart > SAME_SIZE * model.diameter:
         raise ToolkitError(
             f"{session.path}: its {model.name!r} has another mesh than the one given (their boxes are "
             f"{1000 * apart:.1f} mm apart); give the mesh it was annotated with, or annotate again"
+        )
+    symmetry = Symmetry.from_json(record.symmetry)
+    if not model.symmetry.covers(symmetry):
+        raise ToolkitError(
+            f"{session.path}: its {model.name!r} has a symmetry that the mesh given lacks; write it into the "
+            f"material file beside the mesh: {' '.join(symmetry.toml.splitlines())}"
+        )
+    if abs(record.refractive_index - model.refractive_index) > _SAME_INDEX:
+        warnings.warn(
+            f"{session.path}: its {model.name!r} has the refractive index {record.refractive_index:g}; "
+            f"{model.refractive_index:g} is used, which a material file beside the mesh can change",
+            ToolkitWarning,
+            stacklevel=2,
         )
     return poses
 

@@ -23,8 +23,11 @@ _FOLDS = (8, 6, 5, 4, 3, 2)
 _ODD_TURNS = 2 * np.pi * np.array([0.0901699, 0.2360680, 0.3819660, 0.4721360])  # of no small fold
 _PROBES = 1_500
 _MOST_CANDIDATES = 40
-_LARGEST_GROUP = 60
+LARGEST_GROUP = 60
+"""Motions, the identity among them: those of a dodecahedron."""
+
 _SAME_AXIS = np.cos(np.radians(4.0))
+_SAME_TURN = 0.1  # of rotation matrices' entries
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +56,21 @@ class Symmetry:
         around = SE3.from_rotvec(turns[:, None] * self.axis, np.zeros((steps, 3))).as_matrix()
         return (around[:, None] @ discrete[None]).reshape(-1, 4, 4)
 
+    def covers(self, other: Symmetry) -> bool:
+        """Whether every rotation that `other` allows is one of these, nearly."""
+        if other.axis is not None and (self.axis is None or abs(self.axis @ other.axis) < _SAME_AXIS):
+            return False
+        own = self.sampled()[:, :3, :3]
+        return all(
+            np.abs(own - motion[:3, :3]).max(axis=(1, 2)).min() < _SAME_TURN for motion in other.transforms
+        )
+
+    @property
+    def toml(self) -> str:
+        """The table of a material file that declares it."""
+        turns = [SE3.from_matrix(motion) for motion in self.transforms]
+        return _table(None if self.axis is None else _rounded(self.axis), _named(turns))
+
     def to_json(self) -> str:
         """The two keys of the BOP challenge's models_info.json, in metres."""
         continuous = [] if self.axis is None else [{"axis": self.axis.tolist(), "offset": [0.0, 0.0, 0.0]}]
@@ -64,18 +82,26 @@ class Symmetry:
         """Inverse of `to_json`; an empty text means no symmetry.
 
         Raises:
-            ToolkitError: not such a JSON text.
+            ToolkitError: not such a JSON text; several axes, or one beside the origin.
         """
         try:
             data: dict[str, Any] = json.loads(text) if text else {}
             discrete = np.array(data.get("symmetries_discrete", []), dtype=np.float64).reshape(-1, 4, 4)
             continuous = data.get("symmetries_continuous", [])
             axis = np.array(continuous[0]["axis"], dtype=np.float64) if continuous else None
+            centred = not any(
+                np.any(np.cross(one["axis"], one.get("offset", np.zeros(3)))) for one in continuous
+            )
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ToolkitError(
                 f"object symmetry: cannot read {text[:60]!r} ({error}); expected JSON with "
                 "symmetries_discrete (16 numbers each) and symmetries_continuous (axis, offset)"
             ) from error
+        if len(continuous) > 1 or not centred:
+            raise ToolkitError(
+                "object symmetry: one axis at most, through the mesh's origin, can be used; move the origin, "
+                "or declare single turns"
+            )
         return Symmetry(discrete, axis if axis is None else axis / np.linalg.norm(axis))
 
 
@@ -113,12 +139,7 @@ class Proposal:
     @property
     def toml(self) -> str:
         """The table of a material file that accepts it."""
-        lines = ["[symmetry]"]
-        if self.axis is not None:
-            lines.append(f"axis = {_listed(self.axis)}")
-        if self.turns:
-            lines.append(f"turns = [{', '.join(map(_listed, self.turns))}]")
-        return "\n".join(lines)
+        return _table(self.axis, self.turns)
 
 
 def propose(surface: tuple[Array, Array], vertices: Array, diameter: float) -> Proposal:
@@ -155,7 +176,7 @@ def propose(surface: tuple[Array, Array], vertices: Array, diameter: float) -> P
     if revolution is not None:
         upended = [turn for turn in turns if (turn.rotation @ revolution) @ revolution < -_SAME_AXIS][:1]
         return Proposal(_rounded(revolution), _named(upended), worst, offset)
-    return Proposal(None, _named(_group(turns)), worst, offset)
+    return Proposal(None, _named(closed(turns)), worst, offset)
 
 
 class _Likeness:
@@ -207,15 +228,21 @@ def _candidates(points: Array, vertices: Array) -> list[Array]:
     return axes
 
 
-def _group(turns: list[SE3]) -> list[SE3]:
-    """Every product of some rotations but the identity: with two of a cube's turns, all 23."""
+def closed(turns: Sequence[SE3], same: float = _SAME_TURN) -> list[SE3]:
+    """Every product of some rotations but the identity, theirs first: with two of a cube's turns, all 23.
+
+    Stops looking beyond LARGEST_GROUP.
+
+    Args:
+        same: difference of two rotation matrices' entries up to which they count as one.
+    """
     known = [SE3.identity()]
     frontier = known
-    while frontier and len(known) <= _LARGEST_GROUP:
+    while frontier and len(known) <= LARGEST_GROUP:
         reached = [turn @ old for turn, old in product(turns, frontier)]
         frontier = []
         for motion in reached:
-            if all(np.abs(motion.rotation - old.rotation).max() > 0.1 for old in known):
+            if all(np.abs(motion.rotation - old.rotation).max() > same for old in known):
                 known.append(motion)
                 frontier.append(motion)
     return known[1:]
@@ -235,6 +262,15 @@ def _rounded(axis: Array, signed: bool = False) -> tuple[float, ...]:
     """The axis to four digits; unless signed, with its largest component positive."""
     sign = 1.0 if signed else np.sign(axis[np.argmax(np.abs(axis))])
     return tuple(round(float(value), 4) + 0.0 for value in sign * axis)
+
+
+def _table(axis: tuple[float, ...] | None, turns: Sequence[tuple[float, ...]]) -> str:
+    lines = ["[symmetry]"]
+    if axis is not None:
+        lines.append(f"axis = {_listed(axis)}")
+    if turns:
+        lines.append(f"turns = [{', '.join(map(_listed, turns))}]")
+    return "\n".join(lines)
 
 
 def _listed(values: tuple[float, ...]) -> str:

@@ -10,10 +10,13 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from dataset import ToolkitError
+from dataset import SE3, ToolkitError
+from dataset.errors import ToolkitWarning
+from dataset.session import Session
 from s2p3 import object_meshes, objects
-from s2p3.materials import Material
+from s2p3.materials import Material, load_material
 from s2p3.simplify import simplify
+from s2p3.synthesis import session_camera, synthesize
 
 
 @pytest.mark.parametrize(
@@ -183,6 +186,8 @@ def test_a_material_file_beside_the_mesh_is_read(tmp_path: Path) -> None:
         ("roughness = 0.0", "roughness"),
         ("refractiv_index = 1.5", "refractive_index"),
         ("[symmetry]\naxis = [0, 0, 0]", "direction"),
+        ("[symmetry]\nturns = [[0, 0, 1, 2]]", "whole fraction"),
+        ("[symmetry]\nturns = [[0, 0, 1, 7]]", "whole fraction"),
         ("kind = ", "TOML"),
     ],
 )
@@ -195,6 +200,38 @@ def test_a_wrong_material_file_is_told_in_one_line(tmp_path: Path, text: str, pa
     assert str(file) in str(caught.value)
     with pytest.raises(ToolkitError, match="no such file"):
         objects.named_object("cup", material=tmp_path / "missing.toml")
+
+
+def test_what_follows_from_a_turn_is_a_symmetry_too(tmp_path: Path) -> None:
+    file = tmp_path / "gear.toml"
+    file.write_text("[symmetry]\nturns = [[0, 0, 1, 90]]\n")
+    turns = SE3.from_matrix(load_material(file).symmetry.symmetry().transforms).as_rotvec()
+    np.testing.assert_allclose(np.sort(np.linalg.norm(turns, axis=1)), np.radians([90, 90, 180]), atol=1e-9)
+
+
+def test_a_session_tells_of_a_symmetry_that_the_mesh_lacks(tmp_path: Path) -> None:
+    bottle = objects.build("bottle")
+    path = tmp_path / "bottle.h5"
+    synthesize(bottle, 1, session_camera(), 0, path)
+    mesh = _export(tmp_path / "bottle.ply", bottle.vertices, bottle.faces)
+    with Session.open(path) as session:
+        assert len(objects.poses_of(session, bottle).visible_fraction) == 1
+        with pytest.raises(ToolkitError, match=r"symmetry.*material file.*axis = \[0, 0, 1\]"):
+            objects.poses_of(session, objects.named_object("bottle", mesh))
+        (tmp_path / "bottle.toml").write_text("[symmetry]\naxis = [0, 0, -1]\n")
+        with pytest.warns(ToolkitWarning, match="refractive index"):
+            objects.poses_of(session, objects.named_object("bottle", mesh))
+
+
+@pytest.mark.parametrize(
+    "continuous",
+    ['{"axis": [0, 0, 1], "offset": [20, 0, 0]}', '{"axis": [0, 0, 1]}, {"axis": [1, 0, 0]}'],
+)
+def test_a_symmetry_that_cannot_be_used_is_refused(continuous: str) -> None:
+    with pytest.raises(ToolkitError, match="one axis at most, through the mesh's origin"):
+        objects.Symmetry.from_json(f'{{"symmetries_continuous": [{continuous}]}}')
+    along = '{"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 20]}]}'
+    assert objects.Symmetry.from_json(along).axis is not None
 
 
 def _block(size: tuple[float, float, float]) -> objects.ObjectModel:

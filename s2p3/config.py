@@ -200,7 +200,7 @@ class DetectorConfig(SupervisedConfig):
     threshold: float = 0.5
     """Mask probability above which a pixel belongs to the object."""
     minimum_score: float = 0.5
-    """Mean mask probability below which nothing is reported."""
+    """Mean mask probability below which nothing is reported; it can only matter above `threshold`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -87,7 +87,8 @@ def train_student(
 
     Others as `train_teacher`.
 
-    Raises ToolkitError: a warm start without a teacher, or of another object's; see also `train_teacher`.
+    Raises ToolkitError: a warm start without a teacher, of another object, or of other encoders; see also
+        `train_teacher`.
     """
     path, settings = checkpoint.to_write(out / "student.safetensors"), config.student
     examples = Examples.of(sessions, model, config.input, settings, frames, cache)
@@ -98,10 +99,21 @@ def train_student(
             raise ToolkitError(
                 "student.warm_start needs the teacher's checkpoint; give it, or set warm_start = false"
             )
-        network.encoder.load_state_dict(load_teacher(teacher, model)[0].encoder.state_dict())
+        guide, info = load_teacher(teacher, model)
+        if _encoders(info.config) != _encoders(config):
+            raise ToolkitError(
+                f"{teacher}: its encoders see other channels than the student's, or at another stride; "
+                "train both with one experiment.toml, or set student.warm_start = false"
+            )
+        network.encoder.load_state_dict(guide.encoder.state_dict())
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
     run = Pretraining("student", model, config, settings, examples, stage)
     return run.train(network, objective, path, frames.workers, on_step)
+
+
+def _encoders(config: ExperimentConfig) -> tuple[str, str, int]:
+    """What encoders must share for the weights of one to suit the other."""
+    return config.input.modality, config.input.aolp, config.network.total_stride
 
 
 @dataclass(frozen=True)

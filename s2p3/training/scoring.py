@@ -24,8 +24,8 @@ _CHUNK = 32
 class PoseScorer:
     """Recall of ADD, or of ADD-S for an object with a symmetry, at 10 % of the diameter, percent.
 
-    Crops are cut at the annotated boxes and seen as a detector's would be, without augmentation: this chooses
-    among weights, and does not replace the evaluation.
+    Crops are cut at the annotated boxes and masks, without augmentation: this chooses among weights, and does
+    not replace the evaluation.
     """
 
     crops: LabelledCrops

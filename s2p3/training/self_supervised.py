@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dataset.errors import ToolkitError
 from s2p3 import losses, physics
-from s2p3.config import ExperimentConfig, SelfSupervisionConfig
+from s2p3.config import ExperimentConfig, NetworkConfig, SelfSupervisionConfig
 from s2p3.inputs import NetworkInput, View
 from s2p3.networks.pose_head import decode_pose
 from s2p3.networks.student import Student
@@ -111,9 +111,11 @@ def self_supervise(
 
 @dataclass(frozen=True)
 class Pair:
-    """Teacher and student that see the same, the student's experiment, and hashes of both files."""
+    """Teacher and student that see the same, how the teacher is built, the student's experiment, and hashes
+    of both files."""
 
     teacher: Teacher
+    teacher_network: NetworkConfig
     student: Student | Teacher
     config: ExperimentConfig
     hashes: dict[str, str]
@@ -128,7 +130,7 @@ def load_pair(teacher: Path, student: Path, model: ObjectModel) -> Pair:
             f"{teacher} and {student} expect different inputs; train both with one experiment.toml"
         )
     hashes = {"teacher": checkpoint.file_hash(teacher), "student": checkpoint.file_hash(student)}
-    return Pair(guide, network, info.config, hashes)
+    return Pair(guide, guide_info.config.network, network, info.config, hashes)
 
 
 @dataclass(frozen=True)
@@ -262,9 +264,13 @@ def clouds(seen: NetworkInput, surface: RenderOutput, inside: Tensor) -> tuple[T
 
 def _following(pair: Pair, path: Path, settings: SelfSupervisionConfig) -> MeanTeacher:
     """Raises ToolkitError: teacher and student are not of one architecture."""
-    if not isinstance(pair.student, Teacher):
+    built = [
+        (network.total_stride, network.decoder_channels)
+        for network in (pair.teacher_network, pair.config.network)
+    ]
+    if not isinstance(pair.student, Teacher) or built[0] != built[1]:
         raise ToolkitError(
-            f"{path}: a teacher can follow only a student of its own architecture; train one with "
-            'network.student = "large", or set self_supervision.teacher = "frozen"'
+            f"{path}: a teacher can follow only a student of its own architecture; train both with one "
+            'experiment.toml and network.student = "large", or set self_supervision.teacher = "frozen"'
         )
     return MeanTeacher(pair.student, pair.teacher, settings.teacher_decay)

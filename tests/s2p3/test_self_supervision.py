@@ -174,6 +174,10 @@ def test_an_ema_teacher_follows_a_student_of_its_kind(
     assert last["total"] > 0
     with pytest.raises(ToolkitError, match=r'network\.student = "large"'):
         run(cup_session, cup, direct, tmp_path / "direct", teacher="ema", adapt_batches=0)
+    wide = dataclasses.replace(tiny(), network=dataclasses.replace(tiny().network, decoder_channels=48))
+    other = {**large, "teacher": save_untrained(tmp_path / "wide", cup, wide)["teacher"]}
+    with pytest.raises(ToolkitError, match="own architecture"):
+        run(cup_session, cup, other, tmp_path / "wide", teacher="ema", adapt_batches=0)
 
 
 @pytest.mark.parametrize("teacher", ["frozen", "ema"])

@@ -301,6 +301,9 @@ def test_a_warm_start_takes_the_teachers_encoders(
     with pytest.raises(ToolkitError, match="warm_start"):
         train_student([cup_session], cup, experiment, tmp_path, on_step=silent)
     teacher = trained / "teacher.safetensors"
+    other = dataclasses.replace(experiment, input=dataclasses.replace(experiment.input, aolp="angle"))
+    with pytest.raises(ToolkitError, match="encoders see other channels"):
+        train_student([cup_session], cup, other, tmp_path, teacher=teacher, on_step=silent)
     path = train_student([cup_session], cup, experiment, tmp_path, teacher=teacher, on_step=silent)
     wanted, found = load_file(teacher), load_file(path)
     stem = "encoder.polarization.stem.0.weight"

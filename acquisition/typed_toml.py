@@ -30,11 +30,15 @@ else:
 T = TypeVar("T")
 
 
-def load(cls: type[T], path: str | Path, hint: str = "check the path") -> T:
+def load(cls: type[T], path: str | Path, hint: str = "check the path", base: T | None = None) -> T:
     """Reads the dataclass tree `cls` from the TOML file at `path`.
 
-    Raises ToolkitError: the file is missing or unreadable (`hint` says what to do next), is not TOML (with
-    the line), or does not fit `cls` (see `loads`).
+    Args:
+        hint: what to do where the file cannot be read.
+        base: fields left out keep its values; without it, those that `cls` defaults to.
+
+    Raises ToolkitError: the file is missing or unreadable, is not TOML (with the line), or does not fit `cls`
+    (see `loads`).
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -44,11 +48,11 @@ def load(cls: type[T], path: str | Path, hint: str = "check the path") -> T:
         raise ToolkitError(f"{path}: not a text file in UTF-8; {hint}") from error
     except OSError as error:
         raise ToolkitError(f"{path}: cannot be read ({error.strerror}); {hint}") from error
-    return loads(cls, text, source=str(path))
+    return loads(cls, text, str(path), base)
 
 
-def loads(cls: type[T], text: str, source: str = "TOML text") -> T:
-    """Reads the dataclass tree `cls` from TOML `text`; `source` names it in messages.
+def loads(cls: type[T], text: str, source: str = "TOML text", base: T | None = None) -> T:
+    """Reads the dataclass tree `cls` from TOML `text`; `source` names it in messages. `base`: see `load`.
 
     Raises ToolkitError: syntax (with the line), an unknown table or field (with the nearest valid name), a
     missing field, a wrong type, a value out of range.
@@ -59,13 +63,13 @@ def loads(cls: type[T], text: str, source: str = "TOML text") -> T:
         last = f"line {text.count(chr(10)) + 1}, the end of the file"
         what = str(error).replace("end of document", last)
         raise ToolkitError(f"{source}: TOML syntax: {what}; correct that line") from error
-    return from_table(cls, table, source)
+    return from_table(cls, table, source, base)
 
 
-def from_table(cls: type[T], table: Mapping[str, Any], source: str) -> T:
+def from_table(cls: type[T], table: Mapping[str, Any], source: str, base: T | None = None) -> T:
     """Reads the dataclass tree `cls` from nested mappings, such as a parsed file, parts of which may be
     dataclasses already; see `loads`."""
-    value: T = _dataclass(cls, table, source, prefix="")
+    value: T = _dataclass(cls, table, source, "", base)
     return value
 
 
@@ -80,7 +84,7 @@ def nearest(name: str, valid: Iterable[str]) -> str | None:
     return matches[0] if matches else None
 
 
-def _dataclass(cls: Any, table: Mapping[str, Any], source: str, prefix: str) -> Any:
+def _dataclass(cls: Any, table: Mapping[str, Any], source: str, prefix: str, base: Any) -> Any:
     where = f"{source}: [{prefix}]" if prefix else source
     kind = "field" if prefix else "table"
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
@@ -95,7 +99,9 @@ def _dataclass(cls: Any, table: Mapping[str, Any], source: str, prefix: str) -> 
     for name, field in fields.items():
         if name in table:
             key = f"{prefix}.{name}" if prefix else name
-            values[name] = _value(table[name], hints[name], source, key)
+            values[name] = _value(table[name], hints[name], source, key, getattr(base, name, None))
+        elif base is not None:
+            values[name] = getattr(base, name)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             raise ToolkitError(f"{where} lacks the {kind} {name!r}; add it")
     try:
@@ -105,18 +111,18 @@ def _dataclass(cls: Any, table: Mapping[str, Any], source: str, prefix: str) -> 
         raise ToolkitError(f"{where} {what}") from error
 
 
-def _value(value: Any, annotation: Any, source: str, key: str) -> Any:
-    """`value` as the annotated type; `key` is its dotted name."""
+def _value(value: Any, annotation: Any, source: str, key: str, base: Any = None) -> Any:
+    """`value` as the annotated type; `key` is its dotted name, `base` has what a table leaves out."""
     if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
         if isinstance(value, annotation):
             return value
         if not isinstance(value, Mapping):
             raise ToolkitError(f"{source}: {key} must be a table; write it as [{key}]")
-        return _dataclass(annotation, value, source, key)
+        return _dataclass(annotation, value, source, key, base)
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
         (inner,) = (argument for argument in arguments if argument is not type(None))
-        return _value(value, inner, source, key)
+        return _value(value, inner, source, key, base)
     if origin is typing.Literal:
         if value not in arguments:
             guess = f"; did you mean {nearest(value, arguments)!r}?" if isinstance(value, str) else ""

@@ -22,6 +22,8 @@ from s2p3.ranges import BELOW_ONE, COUNT, NOT_NEGATIVE, ODD, POSITIVE, SHARE, at
 
 Schedule = Literal["cosine", "halving", "flat"]
 PhysicsVariant = Literal["dolp", "stokes", "aolp", "dolp-gain", "none"]
+Switch = tyro.conf.FlagConversionOff[bool]
+"""On the command line `--name True` or `--name False`, so that the help of both reads right."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +107,8 @@ class NetworkConfig:
     """Width of the student's pose head."""
     head_hidden: int = 96
     """Hidden units of the student's pose head."""
-    imagenet: bool = True
-    """Start the encoders from ImageNet weights (the paper)."""
+    imagenet: Switch = True
+    """Whether encoders start from ImageNet weights (the paper)."""
 
     def __post_init__(self) -> None:
         check(self, decoder_channels=at_least(2), head_channels=COUNT, head_hidden=COUNT)
@@ -123,14 +125,14 @@ class StageConfig:
     batch: int = 16
     """Images a step, shared out among the processes where there are several."""
     learning_rate: float = 1e-3
-    """The highest of the schedule."""
+    """The peak of the schedule."""
     schedule: Schedule = "cosine"
     """`cosine` with 8 % warm-up (our choice), `halving` at every quarter (the paper: every 25 of 100 epochs),
     or `flat` for 72 % and then a cosine (Self6D++)."""
     weight_decay: float = 1e-2
     """Of AdamW; 0 is Adam (the paper)."""
     clip_norm: float = 5.0
-    """Longest gradient (our choice)."""
+    """Gradients longer than this are scaled down to it (our choice)."""
     ema: float = 0.98
     """Decay of the averaged weights, which are the ones kept; 0 keeps the trained weights themselves."""
     seed: int = 0
@@ -178,7 +180,7 @@ class PretrainConfig(SupervisedConfig):
     dense_weight: float = 1.0
     """Weight of the teacher's dense losses (mask, coordinates, normals), our choice; 0: pose supervision
     only."""
-    warm_start: bool = False
+    warm_start: Switch = False
     """Student: start the encoders from the teacher's instead of ImageNet's."""
 
     def __post_init__(self) -> None:
@@ -217,15 +219,20 @@ class SelfSupervisionConfig(StageConfig):
     clip_norm: float = 2.0
     checkpoint_every: int = 150
     pose_weight: float = 0.3
+    """Weight of L_pose, in diameters."""
     mask_weight: float = 20.0
+    """Weight of L_mask."""
     normals_weight: float = 2.0
+    """Weight of L_normals."""
     physics_weight: float = 2.0
+    """Weight of L_physics."""
     physics: PhysicsVariant = "dolp"
     """`dolp` (the paper's L_physics), `none`, or one of our extensions: `stokes` (DoLP and AoLP), `aolp`,
     `dolp-gain` (DoLP, specular reflection diluted by a factor fitted to each image)."""
     depth: Literal["none", "chamfer", "pixel"] = "none"
     """A loss on measured depth: the paper's ablation, where it replaces the physics; needs recorded depth."""
     depth_weight: float = 1.0
+    """Weight of the loss on depth, in diameters."""
     smoothing: int = 3
     """Side of the box over which Stokes values are averaged before L_physics: less noise bias; 1 for thin
     objects."""
@@ -241,11 +248,11 @@ class SelfSupervisionConfig(StageConfig):
     adapt_batches: int = 25
     """Batches of captured frames on which BatchNorm statistics are re-estimated first (AdaBN); 0: not at
     all."""
-    adapt_teacher: bool = True
+    adapt_teacher: Switch = True
     """Whether the teacher's BatchNorm statistics are re-estimated too."""
-    freeze_norms: bool = False
-    """Whether the student's BatchNorm statistics stay as they are while it learns, or follow the captured
-    frames: those hold the object's size in the box, too, which tells its distance."""
+    freeze_norms: Switch = False
+    """Whether the student's BatchNorm statistics stay as pre-trained while it learns: they also encode how
+    large the object appears in its box, a cue to its distance."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -275,16 +282,19 @@ class Self6DConfig(StageConfig):
     checkpoint_every: int = 150
     schedule: Schedule = "flat"
     pose_weight: float = 10.0
+    """Weight of the distance to the teacher's pose, in diameters."""
     mask_weight: float = 1.0
+    """Weight of the mask's re-weighted cross entropy."""
     chamfer_weight: float = 100.0
+    """Weight of the Chamfer distance to the measured depth."""
     chamfer_limit_m: float = 0.5
     """Points further from the other surface than this do not count."""
     colour_weight: float = 0.2
-    """Of a and b of LAB; grey images have none."""
+    """Weight of the distance in a and b of LAB, which is 0 for grey images."""
     structure_weight: float = 1.0
-    """Of MS-SSIM."""
+    """Weight of MS-SSIM."""
     perceptual_weight: float = 0.15
-    """Of LPIPS."""
+    """Weight of LPIPS."""
     lpips_weights: str = ""
     """File of LPIPS' weights, see `s2p3.networks.perceptual`; without one the term is left out."""
 
@@ -403,13 +413,13 @@ def quick() -> ExperimentConfig:
 PRESETS = {"paper": paper, "fast": fast, "quick": quick}
 
 
-def load(path: str | Path) -> ExperimentConfig:
-    """Reads experiment.toml; fields left out keep the values of `fast`.
+def load(path: str | Path, base: ExperimentConfig | None = None) -> ExperimentConfig:
+    """Reads experiment.toml; fields left out keep the values of `base`, or of `fast`.
 
     Raises ToolkitError: a missing file, an unknown field (with the nearest valid one), a wrong type, values
     that do not fit.
     """
-    return typed_toml.load(ExperimentConfig, path, hint="check the path, or leave it out for the fast preset")
+    return typed_toml.load(ExperimentConfig, path, "check the path, or leave it out", base)
 
 
 def save(config: ExperimentConfig, path: str | Path) -> None:

@@ -35,6 +35,10 @@ from s2p3.config import (
 )
 
 Preset = Literal["fast", "paper", "quick"]
+OptionalPreset = Annotated[
+    Preset | None, tyro.conf.arg(metavar="{fast,paper,quick}", help_behavior_hint="(optional)")
+]
+"""One that need not be given."""
 
 _FAST = PRESETS["fast"]()
 
@@ -89,8 +93,9 @@ SelfSupervisionFields = Annotated[SelfSupervisionPart, _UNDER_CONFIG]
 
 
 def experiment_of(preset: Preset = "fast", config: Path | None = None) -> ExperimentConfig:
-    """The preset, or the file where one is given. Raises ToolkitError as `config.load`."""
-    return PRESETS[preset]() if config is None else load(config)
+    """The preset, with the fields of the file where one is given. Raises ToolkitError as `config.load`."""
+    base = PRESETS[preset]()
+    return base if config is None else load(config, base)
 
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
@@ -108,19 +113,20 @@ def with_defaults(verb: Verb, words: Sequence[str]) -> Verb:
 
 
 def named_in(words: Sequence[str]) -> ExperimentConfig:
-    """The experiment that --config, --preset or --student name; where they are wrong, the verb says so."""
+    """The experiment that --preset or --student names, with the fields of --config; where they are wrong, the
+    verb says so."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("--preset", "--config", "--student"):
         parser.add_argument(name, nargs="?")
     found, _ = parser.parse_known_args(list(words))
     try:
-        if found.config is not None:
-            return load(found.config)
-        if found.student is not None:
-            return _of_checkpoint(Path(found.student))
+        if found.preset is not None or found.student is None:
+            base = PRESETS[found.preset or "fast"]()
+        else:
+            base = _of_checkpoint(Path(found.student))
+        return base if found.config is None else load(found.config, base)
     except (ToolkitError, OSError, ValueError, KeyError, TypeError):
         return _FAST
-    return PRESETS.get(found.preset or "fast", PRESETS["fast"])()
 
 
 def _of_checkpoint(path: Path) -> ExperimentConfig:

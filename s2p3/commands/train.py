@@ -20,6 +20,7 @@ from s2p3.commands.arguments import (
 from s2p3.commands.experiment import (
     DetectorFields,
     DetectorPart,
+    OptionalPreset,
     Preset,
     SelfSupervisionFields,
     SelfSupervisionPart,
@@ -64,7 +65,7 @@ def train_detector(
         out: folder for detector.safetensors and the log; an interrupted training continues.
         mesh: PLY, OBJ or STL of the object, metres.
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
-        config: experiment.toml instead of a preset.
+        config: experiment.toml, whose fields override the preset's.
         threads: CPU threads of the network.
         workers: processes that augment, a thread each; 0: the training does it itself.
     """
@@ -93,7 +94,7 @@ def train_teacher(
     json: bool = False,
     experiment: TeacherFields = _TEACHER,
 ) -> None:
-    """Pre-train the teacher, on synthetic sessions or on annotated ones.
+    """Pre-train the teacher on synthetic sessions.
 
     Args:
         sessions: files with poses of the object, usually synthetic.
@@ -101,7 +102,7 @@ def train_teacher(
         out: folder for teacher.safetensors and the log; an interrupted training continues.
         mesh: PLY, OBJ or STL of the object, metres.
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
-        config: experiment.toml instead of a preset.
+        config: experiment.toml, whose fields override the preset's.
         threads: CPU threads of the network.
         describe: train nothing; say what the teacher weighs and costs, what it takes and gives.
         json: with --describe, as JSON.
@@ -134,7 +135,7 @@ def train_student(
     json: bool = False,
     experiment: StudentFields = _STUDENT,
 ) -> None:
-    """Pre-train the student, on synthetic sessions or on annotated ones.
+    """Pre-train the student on synthetic sessions.
 
     Args:
         sessions: files with poses of the object, usually synthetic.
@@ -143,7 +144,7 @@ def train_student(
         mesh: PLY, OBJ or STL of the object, metres.
         teacher: checkpoint to start the encoders from, where the experiment asks for a warm start.
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
-        config: experiment.toml instead of a preset.
+        config: experiment.toml, whose fields override the preset's.
         threads: CPU threads of the network.
         describe: train nothing; say what the student weighs and costs, what it takes and gives.
         json: with --describe, as JSON.
@@ -158,7 +159,7 @@ def train_student(
 
     _use(threads, frames.workers)
     if teacher is not None and not chosen.student.warm_start:
-        raise ToolkitError("--teacher is what a warm start starts from; add --config.student.warm-start")
+        raise ToolkitError("--teacher is what a warm start starts from; add --config.student.warm-start True")
     model = named_object(object, mesh)
     say(str(train(_some(sessions), model, chosen, out, cache=out.parent, teacher=teacher, frames=frames)))
 
@@ -187,7 +188,7 @@ def train_supervised(
         network: the teacher is PPP-Net, the paper's upper bound.
         mesh: PLY, OBJ or STL of the object, metres.
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
-        config: experiment.toml instead of a preset.
+        config: experiment.toml, whose fields override the preset's.
         threads: CPU threads of the network.
     """
     from s2p3.objects import named_object
@@ -197,7 +198,7 @@ def train_supervised(
     _use(threads, frames.workers)
     chosen, model = experiment.within(experiment_of(preset, config)), named_object(object, mesh)
     train = train_on if network == "teacher" else train_student
-    say(str(train(_some(sessions), model, chosen, out, frames=frames, stage="supervised")))
+    say(str(train(_some(sessions), model, chosen, out, out.parent, frames=frames, stage="supervised")))
 
 
 def train_self_supervised(
@@ -209,6 +210,7 @@ def train_self_supervised(
     student: Path,
     out: Path,
     mesh: OptionalPath = None,
+    preset: OptionalPreset = None,
     config: OptionalPath = None,
     split: str = "train",
     method: Literal["s2p3", "self6d"] = "s2p3",
@@ -226,15 +228,18 @@ def train_self_supervised(
         student: student.safetensors to start from.
         out: folder for adapted.safetensors and the log; an interrupted training continues.
         mesh: PLY, OBJ or STL of the object, metres.
-        config: experiment.toml whose [self_supervision] to use instead of the student's.
+        preset: start from its settings instead of those that the student's experiment holds.
+        config: experiment.toml, whose [self_supervision] or [self6d] overrides fields of those settings; what
+            the networks are and see is the student's.
         split: name of the split to train on.
         method: s2p3 is the paper's, self6d the RGB-D baseline, after Self6D++: it needs depth, and networks
             trained with --config.input.modality rgb.
         threads: CPU threads of the network.
         workers: processes that augment, a thread each; 0: the training does it itself.
     """
+    del preset  # its values, and those of the file, are the options' defaults; here mistakes are told
     if config is not None:
-        load(config)  # its values are the options' defaults; here its mistakes are told
+        load(config)
     from s2p3.learning import adapt
     from s2p3.objects import named_object
 

@@ -34,7 +34,7 @@ def words(*more: Any) -> list[str]:
 
 
 def test_a_field_is_overridden_and_the_rest_is_the_presets(parsed: list[ExperimentConfig]) -> None:
-    cli.main(words("--preset", "paper", "--config.student.steps", 7, "--config.network.no-imagenet"))
+    cli.main(words("--preset", "paper", "--config.student.steps", 7, "--config.network.imagenet", False))
     paper = presets.paper()
     assert parsed == [
         replace(
@@ -59,6 +59,25 @@ def test_a_students_own_experiment_is_the_default_of_its_adaptation(tmp_path: Pa
     (tmp_path / "student.json").write_text(json.dumps({"config": typed_toml.dumps(stored)}))
     assert named_in(["--student", str(tmp_path / "student.safetensors"), "--threads", "2"]) == stored
     assert named_in(["--student", str(tmp_path / "nothing.safetensors")]) == base
+    assert (
+        named_in(["--student", str(tmp_path / "student.safetensors"), "--preset", "paper"]) == presets.paper()
+    )
+
+
+def test_a_file_overrides_only_the_fields_that_it_holds(
+    parsed: list[ExperimentConfig], tmp_path: Path
+) -> None:
+    paper, path = presets.paper(), tmp_path / "experiment.toml"
+    (tmp_path / "student.json").write_text(json.dumps({"config": typed_toml.dumps(paper)}))
+    path.write_text("[self_supervision]\nphysics_weight = 0.5\n[student]\nsteps = 3\n")
+    wanted = replace(
+        paper,
+        self_supervision=replace(paper.self_supervision, physics_weight=0.5),
+        student=replace(paper.student, steps=3),
+    )
+    assert named_in(["--student", str(tmp_path / "student.safetensors"), "--config", str(path)]) == wanted
+    cli.main(words("--preset", "paper", "--config", path))
+    assert parsed == [wanted]
 
 
 @pytest.mark.parametrize(
@@ -81,6 +100,6 @@ def test_help_lists_the_fields_a_stage_depends_on(capfd: pytest.CaptureFixture[s
     with pytest.raises(SystemExit):
         cli.main(["train", "student", "--preset", "paper", "--help"])
     text = " ".join(capfd.readouterr().out.replace("│", " ").split())
-    assert "--config.student.learning-rate FLOAT The highest of the schedule. (default: 0.0001)" in text
+    assert "--config.student.learning-rate FLOAT The peak of the schedule. (default: 0.0001)" in text
     assert "--config.teacher" not in text
     assert "--config.detector" not in text

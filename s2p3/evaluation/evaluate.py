@@ -17,11 +17,11 @@ import numpy as np
 
 from dataset.errors import ToolkitError
 from dataset.session import ObjectPoses, Session
-from s2p3.evaluation import metrics
-from s2p3.evaluation.metrics import Floats
+from s2p3 import metrics
 from s2p3.evaluation.predict import Estimator, Finder
 from s2p3.evaluation.records import Record, Ruler, Subject
 from s2p3.evaluation.summary import Difference, Summary, differences, grouped, of_same_targets, summarize
+from s2p3.metrics import Floats
 from s2p3.networks.detector import Detection
 from s2p3.objects import ObjectModel, poses_of
 from s2p3.training.progress import OnStep, reporting

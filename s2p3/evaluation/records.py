@@ -11,12 +11,9 @@ from typing import Any
 import numpy as np
 
 from dataset import SE3, Intrinsics
-from s2p3.evaluation import metrics
-from s2p3.evaluation.metrics import Floats
+from s2p3 import metrics
+from s2p3.metrics import Floats
 from s2p3.objects import ObjectModel
-
-METRIC_POINTS = 1000
-"""Points on the surface over which ADD and ADD-S are averaged."""
 
 _INFINITE = ("add_m", "add_s_m", "mssd_m", "mspd_px")
 _MEDIANS = ("rotation_deg", "translation_mm", "depth_mm")
@@ -43,7 +40,7 @@ class Subject:
     @staticmethod
     def of(model: ObjectModel, image_width: int, session_id: str) -> Subject:
         """The subject of an object seen in a recording."""
-        return Subject(model.name, metric_name(model), model.diameter, image_width, session_id)
+        return Subject(model.name, metrics.metric_name(model), model.diameter, image_width, session_id)
 
 
 @dataclass(frozen=True)
@@ -119,11 +116,6 @@ class Record(Sight):
         return Record(**values)
 
 
-def metric_name(model: ObjectModel) -> str:
-    """Which metric the object is judged by."""
-    return "ADD-S" if model.symmetry.any else "ADD"
-
-
 @dataclass(frozen=True)
 class Ruler:
     """Measures estimates of one object.
@@ -140,7 +132,7 @@ class Ruler:
 
     @cached_property
     def _points(self) -> Floats:
-        return self.model.surface_points(METRIC_POINTS)
+        return self.model.surface_points(metrics.METRIC_POINTS)
 
     @cached_property
     def _symmetries(self) -> Floats:

@@ -13,7 +13,7 @@ from s2p3.commands.arguments import ObjectName, OptionalPath
 from s2p3.console_output import console, say, show
 
 if TYPE_CHECKING:
-    from s2p3.doctor import Check
+    from s2p3.doctor_check import Check
 
 _LOOK_S = 10.0
 

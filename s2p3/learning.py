@@ -71,10 +71,7 @@ def evaluate_split(
         for network in networks.values():
             Estimator.load(network, model)  # a mistake is told before the detector has run
         found = find_objects(opened, indices, detector, model.name)
-        return {
-            name: evaluate(opened, indices, model, network, detector, found)
-            for name, network in networks.items()
-        }
+        return {name: evaluate(opened, indices, model, network, found) for name, network in networks.items()}
 
 
 def frames_of(session: Session, split: str) -> list[int]:

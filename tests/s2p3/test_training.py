@@ -335,7 +335,7 @@ def detections(session: Session, cup: ObjectModel) -> list[Detection | None]:
 
 
 def test_captured_crops_hold_no_pose() -> None:
-    assert {field.name for field in fields(Crops)} == {"stokes", "mask", "K", "frames", "depth", "valid"}
+    assert {field.name for field in fields(Crops)} == {"stokes", "mask", "K", "depth", "valid"}
 
 
 def test_carried_labels_match_labels_made_on_the_same_view(

@@ -72,7 +72,7 @@ class Evaluation:
                 title: {name: asdict(summary) for name, summary in group.items()}
                 for title, group in self.groups().items()
             },
-            "records": [record.to_json() for record in self.records],
+            "records": [asdict(record) for record in self.records],
         }
         path.write_text(json.dumps(finite(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -97,16 +97,12 @@ class Record(Sight):
         """ADD or ADD-S, as `Subject.metric` says."""
         return self.add_s_m if metric == "ADD-S" else self.add_m
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values; what is not finite as None."""
-        return {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in asdict(self).items()
-        }
-
     @staticmethod
     def from_json(row: Mapping[str, Any]) -> Record:
-        """Inverse of `to_json`. Raises KeyError, TypeError for another layout."""
+        """A record from its fields in JSON, where None stands for what is not finite.
+
+        Raises KeyError, TypeError: another layout.
+        """
         values = dict(row)
         for names, value in ((_INFINITE, math.inf), ((*_MEDIANS, "unseen_deg"), math.nan)):
             values |= {name: value for name in names if row[name] is None}

@@ -71,10 +71,7 @@ def chosen_frames(session: Session, frames: str | None, split: str | None) -> ND
     if (frames is None) == (split is None):
         raise SessionError(f"{session.path}: name the frames either by --frames or by --split")
     if split is not None:
-        if split not in session.splits:
-            known = ", ".join(session.splits) or "none"
-            raise SessionError(f"{session.path} has no split {split!r}; its splits: {known}")
-        return session.splits[split]
+        return session.frames_in(split)
     text = str(frames).replace(" ", "")
     if found := _SLICE.fullmatch(text):
         start, stop, step = (int(part) if part else None for part in found.groups())

@@ -34,9 +34,8 @@ from dataset.errors import ToolkitError
 from dataset.splits import split_session
 from s2p3 import objects
 from s2p3.annotation import annotate
-from s2p3.commands.capture import recording
-from s2p3.commands.output import counting, say
 from s2p3.config import PRESETS
+from s2p3.console_output import counting, recording, say
 from s2p3.demo_report import compare, write_report
 from s2p3.evaluation import Evaluation
 from s2p3.lab import LabTruth, Operator, RunningLab, found_lab, running_lab

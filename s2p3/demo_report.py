@@ -14,8 +14,8 @@ from calibration import Calibration, html
 from calibration.steps import report_path
 from dataset.session import Session
 from dataset.transforms import SE3, rotation_error_deg, translation_error_mm
-from s2p3 import objects
-from s2p3.evaluation import Evaluation, metrics
+from s2p3 import metrics, objects
+from s2p3.evaluation import Evaluation
 from s2p3.evaluation.report import evaluation_section
 from s2p3.lab import LabTruth
 from s2p3.objects import ObjectModel

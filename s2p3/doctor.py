@@ -11,12 +11,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dataset.errors import ToolkitError
+from s2p3.doctor_check import Check, failed, unless
 
 if TYPE_CHECKING:
     from acquisition.rig import Rig
@@ -26,23 +26,6 @@ _FRAME_PIXELS = 2448 * 2048
 _COMPRESSION = 1.4  # of noisy mosaics; a little less than measured
 _TRIAL_BYTES = 128 << 20
 _FEWEST_FREE_BYTES = 10e9
-
-
-@dataclass(frozen=True)
-class Check:
-    """One line of the doctor's report.
-
-    Attributes:
-        name: what was checked.
-        ok: whether it will do.
-        detail: what was found.
-        fix: what to do; empty where it will do.
-    """
-
-    name: str
-    ok: bool
-    detail: str
-    fix: str = ""
 
 
 def doctor(rig: Rig | None = None, folder: Path | None = None) -> Iterator[Check]:
@@ -199,14 +182,3 @@ def _version(name: str) -> str | None:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
-
-
-def unless(ok: bool, fix: str) -> str:
-    """The fix of a check, empty where it will do."""
-    return "" if ok else fix
-
-
-def failed(name: str, error: ToolkitError) -> Check:
-    """An error of the toolkit says what happened and, after the first semicolon, what to do."""
-    what, _, remedy = str(error).partition("; ")
-    return Check(name, False, what, remedy or what)

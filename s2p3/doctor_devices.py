@@ -12,7 +12,7 @@ import numpy as np
 
 from dataset.clocks import fit_clock
 from dataset.errors import ToolkitError
-from s2p3.doctor import Check, failed, unless
+from s2p3.doctor_check import Check, failed, unless
 
 if TYPE_CHECKING:
     from acquisition.camera import Camera

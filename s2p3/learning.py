@@ -71,10 +71,7 @@ def evaluate_split(
         for network in networks.values():
             Estimator.load(network, model)  # a mistake is told before the detector has run
         found = find_objects(opened, indices, detector, model.name)
-        return {
-            name: evaluate(opened, indices, model, network, detector, found)
-            for name, network in networks.items()
-        }
+        return {name: evaluate(opened, indices, model, network, found) for name, network in networks.items()}
 
 
 def frames_of(session: Session, split: str) -> list[int]:
@@ -83,12 +80,7 @@ def frames_of(session: Session, split: str) -> list[int]:
     Raises:
         SessionError: the session has no such split, or it is empty.
     """
-    if split not in session.splits:
-        known = ", ".join(session.splits) or "none"
-        raise SessionError(
-            f"{session.path}: no split {split!r} (its splits: {known}); "
-            f"make one with: s2p3 dataset split {session.path}"
-        )
-    if not len(session.splits[split]):
+    indices = [int(index) for index in session.frames_in(split)]
+    if not indices:
         raise SessionError(f"{session.path}: the split {split!r} is empty; choose another, or make it again")
-    return [int(index) for index in session.splits[split]]
+    return indices

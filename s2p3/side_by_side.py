@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataset.errors import ToolkitError
-from s2p3.commands.output import counting_many
+from s2p3.console_output import counting_many
 
 _POLL_S = 1.0
 _TAIL_BYTES = 4096

@@ -8,8 +8,9 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -46,11 +47,18 @@ SDKS_IN_USE = {"gi", "rtde_control"}
 
 @dataclass(frozen=True)
 class Import:
-    """One imported module: its full dotted name, where, and whether importing the file executes it."""
+    """One imported module: its full dotted name, where, and whether importing the file executes it.
+
+    Attributes:
+        names: what is imported from the module; maybe modules themselves.
+        for_types: whether only a type checker sees it.
+    """
 
     module: str
     line: int
     at_top: bool
+    names: tuple[str, ...] = ()
+    for_types: bool = False
 
     @property
     def package(self) -> str:
@@ -62,21 +70,22 @@ def imports(source: str, package: str = "") -> list[Import]:
     return list(_walk(ast.parse(source), package, at_top=True))
 
 
-def _walk(node: ast.AST, package: str, at_top: bool) -> Iterator[Import]:
+def _walk(node: ast.AST, package: str, at_top: bool, for_types: bool = False) -> Iterator[Import]:
     if isinstance(node, ast.Import):
         for alias in node.names:
-            yield Import(alias.name, node.lineno, at_top)
+            yield Import(alias.name, node.lineno, at_top, (), for_types)
     elif isinstance(node, ast.ImportFrom):
         parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-        yield Import(".".join([*parents, *([node.module] if node.module else [])]), node.lineno, at_top)
+        module = ".".join([*parents, *([node.module] if node.module else [])])
+        yield Import(module, node.lineno, at_top, tuple(alias.name for alias in node.names), for_types)
     elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
         if node.args and isinstance(node.args[0], ast.Constant):
             yield Import(str(node.args[0].value), node.lineno, at_top)
     elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-        at_top = False
+        at_top, for_types = False, True
     inside = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
     for child in ast.iter_child_nodes(node):
-        yield from _walk(child, package, at_top and not inside)
+        yield from _walk(child, package, at_top and not inside, for_types)
 
 
 def files(room: str) -> list[Path]:
@@ -101,6 +110,53 @@ def test_rooms_import_one_way(room: str) -> None:
         for item in wrong_arrows(imports_of(path), room)
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def module_name(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
+def loaded(item: Import, modules: Collection[str]) -> set[str]:
+    """Those of `modules` that an import takes: what it names are modules, or come from one."""
+    names = [f"{item.module}.{name}" for name in item.names]
+    found = set()
+    for path in names or [item.module]:
+        places = (path, f"{path}.__init__", item.module, f"{item.module}.__init__")
+        found |= set([place for place in places if place in modules][:1])
+    return found
+
+
+def parting(importer: str, imported: str) -> tuple[str, str]:
+    """The two names, of modules or packages beside each other, at which the paths of two modules part."""
+    one, other = importer.split("."), imported.split(".")
+    depth = next(depth for depth, (a, b) in enumerate(zip(one, other, strict=False), start=1) if a != b)
+    return ".".join(one[:depth]), ".".join(other[:depth])
+
+
+def arrows(found: dict[str, list[Import]]) -> dict[str, set[str]]:
+    """Which modules and packages import which beside them when the program runs, by the imports of each
+    module."""
+    inside: dict[str, set[str]] = {}
+    for importer, items in found.items():
+        for item in (item for item in items if not item.for_types):
+            for imported in loaded(item, found) - {importer}:
+                one, other = parting(importer, imported)
+                inside.setdefault(one, set()).add(other)
+    return inside
+
+
+def cycle(found: dict[str, list[Import]]) -> list[str]:
+    """Modules and packages that import each other in a ring; none where there is no ring."""
+    try:
+        TopologicalSorter(arrows(found)).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def test_no_imports_of_the_method_run_in_a_ring() -> None:
+    ring = cycle({module_name(path): imports_of(path) for path in files("s2p3")})
+    assert not ring, " is imported by ".join(ring)
 
 
 def importers(sdk: str) -> dict[Path, list[Import]]:
@@ -191,6 +247,26 @@ def test_loaded_packages_are_seen() -> None:
 def test_wrong_arrows_are_found(source: str, expected: list[str]) -> None:
     wrong = wrong_arrows(imports(source, "acquisition.cameras"), "acquisition")
     assert [item.module for item in wrong] == expected
+
+
+@pytest.mark.parametrize(
+    ("source", "ring"),
+    [
+        ("from s2p3 import b", {"s2p3.a", "s2p3.b"}),
+        ("from s2p3.b import inner", {"s2p3.a", "s2p3.b"}),
+        ("def f():\n    from s2p3.b.inner import x", {"s2p3.a", "s2p3.b"}),
+        ("if TYPE_CHECKING:\n    from s2p3 import b", set()),
+        ("import numpy", set()),
+    ],
+)
+def test_rings_are_found(source: str, ring: set[str]) -> None:
+    others = {
+        "s2p3.__init__": "",
+        "s2p3.b.__init__": "from s2p3.b.inner import x",
+        "s2p3.b.inner": "from s2p3.a import y\nfrom s2p3.b import other",
+        "s2p3.b.other": "",
+    }
+    assert set(cycle({name: imports(text) for name, text in {"s2p3.a": source, **others}.items()})) == ring
 
 
 @pytest.mark.parametrize(

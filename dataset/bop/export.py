@@ -126,12 +126,7 @@ def _frames(path: Path, split: str | None) -> NDArray[np.int64]:
     with Session.open(path) as session:
         if not session.complete:
             raise SessionError(f"{path} is incomplete; run first: s2p3 dataset repair {path}")
-        if split is None:
-            return np.arange(len(session))
-        if split not in session.splits:
-            known = ", ".join(session.splits) or "none"
-            raise SessionError(f"{path} has no split {split!r}; its splits: {known}")
-        return session.splits[split]
+        return np.arange(len(session)) if split is None else session.frames_in(split)
 
 
 def _objects(paths: Sequence[Path]) -> dict[str, ObjectRecord]:

@@ -365,6 +365,21 @@ class Session:
         """Frame indices by split name."""
         return {name: self.contents.read(f"splits/{name}") for name in self.contents.names("splits")}
 
+    def frames_in(self, split: str) -> NDArray[np.int64]:
+        """Frame indices of one split.
+
+        Raises:
+            SessionError: there is no such split.
+        """
+        splits = self.splits
+        if split not in splits:
+            known = ", ".join(splits) or "none"
+            raise SessionError(
+                f"{self.path}: no split {split!r} (its splits: {known}); "
+                f"make one with: s2p3 dataset split {self.path}"
+            )
+        return splits[split]
+
     @cached_property
     def _distorted_working_intrinsics(self) -> Intrinsics:
         if self.intrinsics is None:

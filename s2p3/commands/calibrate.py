@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from s2p3.commands.arguments import ObjectName, OptionalPath, at_least
-from s2p3.commands.output import counting, say
+from s2p3.console_output import counting, say
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

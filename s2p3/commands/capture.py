@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dataset.errors import ToolkitError
 from s2p3.commands.arguments import at_least
-from s2p3.commands.output import counting, say
+from s2p3.console_output import recording, say
 
 if TYPE_CHECKING:
     from acquisition.clearance import CarriedCamera
-    from acquisition.recorder import OnProgress, Progress
+    from acquisition.recorder import Progress
     from acquisition.rig import Rig
     from acquisition.routes import Floats, Route
 
@@ -212,18 +211,6 @@ def _draw(rig: Rig, out: Path, plan: Callable[[CarriedCamera, Floats], Route]) -
         f"upper hemisphere seen, rotations up to {route.rotation_spread_deg:.0f} deg, about "
         f"{route.duration_s:.0f} s; nothing has moved"
     )
-
-
-@contextmanager
-def recording(label: str) -> Iterator[OnProgress]:
-    """A progress bar for a recording."""
-    with counting(label) as bar:
-
-        def report(progress: Progress) -> None:
-            total = round(progress.frames / progress.done) if progress.done else progress.frames
-            bar(progress.frames, max(total, progress.frames))
-
-        yield report
 
 
 def summary(out: Path, done: Progress) -> str:

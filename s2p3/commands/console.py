@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from s2p3.commands.arguments import OptionalPath, at_least
-from s2p3.commands.output import counting, say
+from s2p3.console_output import counting, say
 
 Token = Annotated[str | None, tyro.conf.arg(metavar="TOKEN", help_behavior_hint="(optional)")]
 """What a page's users must know."""

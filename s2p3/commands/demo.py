@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from s2p3.commands.arguments import ObjectName
-from s2p3.commands.output import console, say, show
+from s2p3.console_output import console, say, show
 
 
 def demo(

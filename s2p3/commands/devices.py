@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 
 from s2p3.commands.arguments import ObjectName, OptionalPath
-from s2p3.commands.output import console, say, show
+from s2p3.console_output import console, say, show
 
 if TYPE_CHECKING:
-    from s2p3.doctor import Check
+    from s2p3.doctor_check import Check
 
 _LOOK_S = 10.0
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from s2p3.commands.arguments import OptionalPath, Sessions
-from s2p3.commands.output import counting, say
+from s2p3.console_output import counting, say
 
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="(optional)")]
 OptionalCount = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")]

@@ -11,7 +11,7 @@ from s2p3.commands.arguments import (
     OptionalPath,
     at_least,
 )
-from s2p3.commands.output import counting, say
+from s2p3.console_output import counting, say
 
 if TYPE_CHECKING:
     from s2p3.objects import ObjectModel

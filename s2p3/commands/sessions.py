@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 
 from s2p3.commands.arguments import ObjectName, OptionalPath
-from s2p3.commands.output import counting, say, show
+from s2p3.console_output import counting, say, show
 
 
 def annotate(

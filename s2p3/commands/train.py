@@ -32,8 +32,8 @@ from s2p3.commands.experiment import (
     TeacherPart,
     experiment_of,
 )
-from s2p3.commands.output import say, show
 from s2p3.config import FrameSource, load
+from s2p3.console_output import say, show
 
 if TYPE_CHECKING:
     from s2p3.config import ExperimentConfig

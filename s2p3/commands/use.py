@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from s2p3.commands.arguments import ObjectName, OptionalPath, at_least
-from s2p3.commands.output import say, show
+from s2p3.console_output import say, show
 
 Network = Annotated[Path, tyro.conf.arg(metavar="FILE")]
 """A checkpoint (.safetensors), or a model exported from one (.onnx)."""

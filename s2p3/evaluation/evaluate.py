@@ -1,4 +1,4 @@
-"""Runs detector and network over the frames of a session and compares with the annotated poses.
+"""Runs detector and network over the frames of a session, and compares with the annotated poses.
 
 The truth is read for comparing only: boxes and masks that reach the network are the detector's. Every frame
 that shows the object is a target; one without an estimate counts as failed.
@@ -17,11 +17,11 @@ import numpy as np
 
 from dataset.errors import ToolkitError
 from dataset.session import ObjectPoses, Session
-from s2p3.evaluation import metrics
-from s2p3.evaluation.metrics import Floats
+from s2p3 import metrics
 from s2p3.evaluation.predict import Estimator, Finder
 from s2p3.evaluation.records import Record, Ruler, Subject
 from s2p3.evaluation.summary import Difference, Summary, differences, grouped, of_same_targets, summarize
+from s2p3.metrics import Floats
 from s2p3.networks.detector import Detection
 from s2p3.objects import ObjectModel, poses_of
 from s2p3.training.progress import OnStep, reporting
@@ -72,7 +72,7 @@ class Evaluation:
                 title: {name: asdict(summary) for name, summary in group.items()}
                 for title, group in self.groups().items()
             },
-            "records": [record.to_json() for record in self.records],
+            "records": [asdict(record) for record in self.records],
         }
         path.write_text(json.dumps(finite(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -111,8 +111,7 @@ def evaluate(
     indices: Sequence[int],
     model: ObjectModel,
     network: Path,
-    detector: Path,
-    detections: Sequence[Detection | None] | None = None,
+    detections: Sequence[Detection | None],
     on_step: OnStep | None = None,
 ) -> Evaluation:
     """Evaluates a teacher or student on frames of an annotated session.
@@ -120,13 +119,11 @@ def evaluate(
     Args:
         indices: of the frames, usually a split.
         network: checkpoint or ONNX file of the teacher or student.
-        detector: checkpoint or ONNX file of the detector.
-        detections: the detector's answers for `indices` where `find_objects` has been run already.
+        detections: the detector's answers for `indices`, see `find_objects`.
 
-    Raises ToolkitError: no frame of `indices` shows the object; checkpoints missing or of another object.
+    Raises ToolkitError: no frame of `indices` shows the object; a checkpoint missing or of another object.
     """
     estimate = Estimator.load(network, model)
-    find = Finder.load(detector, model.name)
     poses = poses_of(session, model)
     targets = targets_of(session, indices, poses, model.name)
     camera = session.working_intrinsics
@@ -135,8 +132,7 @@ def evaluate(
     with reporting("evaluation", len(targets), on_step) as report:
         for count, position in enumerate(targets, start=1):
             index = int(indices[position])
-            stokes = session.stokes(index).stack()
-            detection = find(stokes) if detections is None else detections[position]
+            stokes, detection = session.stokes(index).stack(), detections[position]
             depth = session.depth(index) if session.has_depth else None
             found = None if detection is None else estimate(stokes, detection, camera, depth)
             true = poses.T_cam_obj[index]

@@ -16,7 +16,7 @@ import cv2
 from acquisition.rig import Rig
 from calibration import Calibration
 from dataset import SE3
-from dataset.errors import SessionError, ToolkitError
+from dataset.errors import ToolkitError
 from dataset.frames import Mosaic
 from dataset.pictures import Picture, in_colour, to_bytes
 from dataset.session import Session
@@ -110,10 +110,7 @@ def opened_source(
     """
     if source.suffix == ".h5":
         with Session.open(source) as session:
-            if split is not None and split not in session.splits:
-                known = ", ".join(session.splits) or "none"
-                raise SessionError(f"{source}: no split {split!r} (its splits: {known})")
-            frames = range(len(session)) if split is None else session.splits[split]
+            frames = range(len(session)) if split is None else session.frames_in(split)
             yield session_shots(session, [int(index) for index in frames][:count])
         return
     is_rig = source.suffix == ".toml"

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from dataset import SE3, Intrinsics
-from s2p3.evaluation import metrics
-from s2p3.evaluation.metrics import Floats
+from s2p3 import metrics
+from s2p3.metrics import Floats
 from s2p3.objects import ObjectModel
-
-METRIC_POINTS = 1000
-"""Points on the surface over which ADD and ADD-S are averaged."""
 
 _INFINITE = ("add_m", "add_s_m", "mssd_m", "mspd_px")
 _MEDIANS = ("rotation_deg", "translation_mm", "depth_mm")
@@ -43,7 +40,7 @@ class Subject:
     @staticmethod
     def of(model: ObjectModel, image_width: int, session_id: str) -> Subject:
         """The subject of an object seen in a recording."""
-        return Subject(model.name, metric_name(model), model.diameter, image_width, session_id)
+        return Subject(model.name, metrics.metric_name(model), model.diameter, image_width, session_id)
 
 
 @dataclass(frozen=True)
@@ -100,16 +97,12 @@ class Record(Sight):
         """ADD or ADD-S, as `Subject.metric` says."""
         return self.add_s_m if metric == "ADD-S" else self.add_m
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values; what is not finite as None."""
-        return {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in asdict(self).items()
-        }
-
     @staticmethod
     def from_json(row: Mapping[str, Any]) -> Record:
-        """Inverse of `to_json`. Raises KeyError, TypeError for another layout."""
+        """A record from its fields in JSON, where None stands for what is not finite.
+
+        Raises KeyError, TypeError: another layout.
+        """
         values = dict(row)
         for names, value in ((_INFINITE, math.inf), ((*_MEDIANS, "unseen_deg"), math.nan)):
             values |= {name: value for name in names if row[name] is None}
@@ -117,11 +110,6 @@ class Record(Sight):
             values["T_cam_obj"] = tuple(map(tuple, values["T_cam_obj"]))
             values["box_xywh"] = tuple(values["box_xywh"])
         return Record(**values)
-
-
-def metric_name(model: ObjectModel) -> str:
-    """Which metric the object is judged by."""
-    return "ADD-S" if model.symmetry.any else "ADD"
 
 
 @dataclass(frozen=True)
@@ -140,7 +128,7 @@ class Ruler:
 
     @cached_property
     def _points(self) -> Floats:
-        return self.model.surface_points(METRIC_POINTS)
+        return self.model.surface_points(metrics.METRIC_POINTS)
 
     @cached_property
     def _symmetries(self) -> Floats:

@@ -15,9 +15,9 @@ from dataset import SE3, Intrinsics
 from dataset.session import Session
 from s2p3.evaluation.bootstrap import Interval
 from s2p3.evaluation.evaluate import Evaluation
-from s2p3.evaluation.metrics import Floats, recall_curve
 from s2p3.evaluation.summary import Summary
 from s2p3.inputs import extract_crop, square_box
+from s2p3.metrics import Floats, recall_curve
 from s2p3.objects import ObjectModel
 from s2p3.rendering import rasterize
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataset.errors import ToolkitError
-from s2p3.evaluation import metrics
+from s2p3 import metrics
 from s2p3.evaluation.bootstrap import Interval, interval, mean, median, resamples
-from s2p3.evaluation.metrics import Floats
 from s2p3.evaluation.records import Record, Subject
+from s2p3.metrics import Floats
 
 Statistic = Callable[[Floats], Floats]
 

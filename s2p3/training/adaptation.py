@@ -14,7 +14,6 @@ from s2p3.networks.student import Student
 from s2p3.networks.teacher import Teacher
 from s2p3.training.batches import form_input
 from s2p3.training.crops import Crops
-from s2p3.training.loop import sample_indices
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -62,7 +61,7 @@ def adapt_batch_norm(
     set_momentum(network, _MOMENTUM)
     network.train()
     for _ in range(settings.adapt_batches):
-        indices = sample_indices(len(crops), _BATCH, generator)
+        indices = torch.randint(0, len(crops), (_BATCH,), generator=generator)
         view = View.random(_BATCH, config.augmentation, generator)
         seen = form_input(crops, indices, view, refractive_index, config, generator)
         network(seen.polarization, seen.priors)

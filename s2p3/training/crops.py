@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 _ASKEW = np.array([0.36, 0.48, 0.8])  # a direction that is no axis of any usual symmetry
+_KEPT = 2  # which tensors a file of crops holds: one that holds others is not read, but made anew
 _MINIMUM_VISIBLE = 0.3  # our choice: frames that show less of the object than this are not trained on
 
 
@@ -46,7 +47,6 @@ class Crops:
         stokes: (N, 3, P, P) float16.
         mask: (N, 1, P, P) float16, 0 to 1: predicted, or the visible mask where the truth is known.
         K: (N, 3, 3) float32, intrinsics of the crops.
-        frames: (N,) int64, frame index in the session (or position in the list of sessions' frames).
         depth: (N, 1, P, P) float16 metres, 0 unknown; None where the sessions have none.
         valid: (N, 1, P, P) bool, where `stokes` is a measurement: neither saturated nor too dark; None where
             nobody asks.
@@ -55,7 +55,6 @@ class Crops:
     stokes: Tensor
     mask: Tensor
     K: Tensor
-    frames: Tensor
     depth: Tensor | None = None
     valid: Tensor | None = None
 
@@ -126,7 +125,7 @@ def crops_hash(crops: Crops) -> str:
 def fingerprint(paths: Sequence[Path], model: ObjectModel, config: InputConfig) -> str:
     """A short hash of which sessions, which object and which crops."""
     hashes = content_hashes(paths, model)
-    return hashlib.sha256(f"{model.fingerprint} {config} {hashes}".encode()).hexdigest()[:16]
+    return hashlib.sha256(f"{_KEPT} {model.fingerprint} {config} {hashes}".encode()).hexdigest()[:16]
 
 
 def labelled_crops(
@@ -163,7 +162,6 @@ def labelled_crops(
                         session.working_intrinsics,
                         model,
                         config,
-                        len(rows),
                         depth_of(session, index, config),
                     )
                     rows.append(crop)
@@ -201,7 +199,6 @@ def labelled_crop(
     intrinsics: Intrinsics,
     model: ObjectModel,
     config: InputConfig,
-    frame: int,
     depth: NDArray[np.float32] | None = None,
 ) -> dict[str, NDArray[np.generic]]:
     """One row of `LabelledCrops`.
@@ -209,10 +206,9 @@ def labelled_crop(
     Args:
         stokes: (H, W, 3) undistorted, or a memory map of it: only the part under the crop is read.
         mask: (H, W), visible, not empty.
-        frame: what the row's `frames` says.
         depth: (H, W) metres, where there is one.
     """
-    crop = _crop(stokes, mask, mask_box(mask), intrinsics, config, frame, depth)
+    crop = _crop(stokes, mask, mask_box(mask), intrinsics, config, depth)
     return crop | _truth(crop["K"], mask, T_cam_obj, intrinsics, model, config)
 
 
@@ -242,7 +238,7 @@ def captured_crops(
             continue
         stokes, depth = session.stokes(index), depth_of(session, index, config)
         image, camera = np.moveaxis(stokes.stack(), 0, -1), session.working_intrinsics
-        row = _crop(image, found.mask, found.box_xywh, camera, config, index, depth)
+        row = _crop(image, found.mask, found.box_xywh, camera, config, depth)
         region = square_box(found.box_xywh, config.canonical_zoom)
         whole = extract_crop(stokes.valid[None].astype(np.float32), region, config.canonical_size)
         rows.append({**row, "valid": whole > 0.999})
@@ -277,7 +273,7 @@ def single_crop(
     depth: NDArray[np.float32] | None = None,
 ) -> Crops:
     """The crop (N = 1) of one undistorted Stokes image (3, H, W) at a predicted box."""
-    row = _crop(np.moveaxis(stokes, 0, -1), found.mask, found.box_xywh, intrinsics, config, 0, depth)
+    row = _crop(np.moveaxis(stokes, 0, -1), found.mask, found.box_xywh, intrinsics, config, depth)
     return Crops(**_stacked([row]))
 
 
@@ -304,7 +300,6 @@ def _crop(
     box: NDArray[np.float64],
     intrinsics: Intrinsics,
     config: InputConfig,
-    frame: int,
     depth: NDArray[np.float32] | None,
 ) -> dict[str, NDArray[np.generic]]:
     region = square_box(box, config.canonical_zoom)
@@ -321,7 +316,6 @@ def _crop(
         "stokes": crop[:3],
         "mask": crop[3:],
         "K": crop_intrinsics(intrinsics, region, config.canonical_size),
-        "frames": np.array(frame, dtype=np.int64),
     }
 
 

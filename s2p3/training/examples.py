@@ -109,7 +109,7 @@ def divide(
         order = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(settings.seed))]
         origin = f"{count} of {len(rows)} frames, drawn with seed {settings.seed}"
         return Division(order[count:].sort().values, order[:count].sort().values, None, origin)
-    if Path(validation).is_file():
+    if Path(validation).suffix == ".h5" or Path(validation).is_file():
         return Division(rows, nothing, Path(validation), f"the session {validation}")
     held_out = _of_split(sessions, shown, validation)
     rows = rows[~torch.isin(rows, held_out)]
@@ -123,13 +123,7 @@ def _of_split(sessions: Sequence[Path], shown: Sequence[tuple[int, int]], split:
     allowed: set[tuple[int, int]] = set()
     for number, path in enumerate(sessions):
         with Session.open(path) as session:
-            if split not in session.splits:
-                known = ", ".join(session.splits) or "none"
-                raise ToolkitError(
-                    f"{path}: no split {split!r} (its splits: {known}), and no session of that name; "
-                    f"make one with: s2p3 dataset split {path}"
-                )
-            allowed |= {(number, int(index)) for index in session.splits[split]}
+            allowed |= {(number, int(index)) for index in session.frames_in(split)}
     rows = [row for row, place in enumerate(shown) if place in allowed]
     if not rows:
         raise ToolkitError(f"the split {split!r} holds no frame that shows the object; choose another")

@@ -82,7 +82,6 @@ class CropDataset(Dataset[Row]):
             session.working_intrinsics,
             self.model,
             self.config,
-            row,
             depth_of(session, index, self.config),
         )
 

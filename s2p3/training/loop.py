@@ -188,11 +188,6 @@ def update_average(average: nn.Module, network: nn.Module, decay: float) -> None
             mean.copy_(value)
 
 
-def sample_indices(samples: int, batch: int, generator: torch.Generator) -> Tensor:
-    """(batch,) indices drawn with replacement."""
-    return torch.randint(0, samples, (batch,), generator=generator)
-
-
 def _not_finite(
     label: str,
     step: int,

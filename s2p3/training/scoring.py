@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from dataset import SE3
+from s2p3 import metrics
 from s2p3.config import ExperimentConfig
 from s2p3.inputs import View
 from s2p3.networks.pose_head import decode_pose
@@ -35,14 +36,12 @@ class PoseScorer:
     @property
     def name(self) -> str:
         """Which of the two it is."""
-        return "add_s_recall_10" if self.model.symmetry.any else "add_recall_10"
+        return f"{metrics.metric_name(self.model).lower().replace('-', '_')}_recall_10"
 
     @torch.no_grad()
     def __call__(self, network: nn.Module) -> float:
-        from s2p3.evaluation import metrics, records  # they evaluate what is trained here
-
-        points = self.model.surface_points(records.METRIC_POINTS)
-        error = metrics.add_s if self.model.symmetry.any else metrics.add
+        points = self.model.surface_points(metrics.METRIC_POINTS)
+        error = metrics.ERRORS[metrics.metric_name(self.model)]
         errors = []
         for start in range(0, len(self.crops), _CHUNK):
             chosen = torch.arange(start, min(start + _CHUNK, len(self.crops)))

@@ -319,7 +319,9 @@ def test_a_later_write_replaces_an_earlier_one(
     write_object(recorded, replace(tetrahedron, material="glass"))
     write_poses(recorded, T_base_cam.inverse(), 0.0, 0.0, {})
     with Session.open(recorded) as session:
-        assert session.splits["test"].tolist() == [11]
+        assert session.splits["test"].tolist() == session.frames_in("test").tolist() == [11]
+        with pytest.raises(SessionError, match=r"no split 'noon' \(its splits: .*test.*s2p3 dataset split"):
+            session.frames_in("noon")
         assert session.object("tetra").material == "glass"
         assert session.poses is not None
         np.testing.assert_allclose((session.poses @ T_base_cam).as_matrix()[0], np.eye(4), atol=1e-12)

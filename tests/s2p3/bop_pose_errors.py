@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from s2p3.evaluation.metrics import SYMMETRY_STEPS
+from s2p3.metrics import SYMMETRY_STEPS
 from s2p3.objects import Symmetry
 
 HERE = Path(__file__).parent

@@ -13,7 +13,7 @@ import pytest
 
 from dataset import SE3
 from dataset.session import ObjectPoses, Session, mask_box, write_poses
-from s2p3.evaluation.metrics import add, add_s
+from s2p3.metrics import add, add_s
 from s2p3.silhouettes import check_masks
 
 GOLDEN = Path(__file__).parents[1] / "dataset" / "golden"

@@ -15,7 +15,8 @@ from acquisition.robots.rtde import RtdeReader
 from acquisition.simulation.camera import SimulatedCamera
 from acquisition.simulation.robot import SimulatedRobot
 from dataset.frames import RawFrame
-from s2p3.doctor import Check, doctor
+from s2p3.doctor import doctor
+from s2p3.doctor_check import Check
 from s2p3.doctor_devices import stream_check
 
 MACHINE = [

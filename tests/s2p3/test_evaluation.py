@@ -52,7 +52,7 @@ def test_every_target_is_counted(
     with Session.open(cup_session) as session:
         found = found_in(session, cup)
         found[2] = found[5] = None
-        result = evaluate(session, range(8), cup, *networks, found, silent)
+        result = evaluate(session, range(8), cup, networks[0], found, silent)
     assert (result.summary.targets, result.summary.missed, result.summary.metric) == (8, 2, "ADD")
     assert np.isinf(result.errors_m).tolist() == [i in (2, 5) for i in range(8)]
     result.save(tmp_path / "evaluation.json")
@@ -87,7 +87,7 @@ def test_an_empty_split_is_said_clearly(
     cup_session: Path, cup: ObjectModel, networks: tuple[Path, Path]
 ) -> None:
     with Session.open(cup_session) as session, pytest.raises(ToolkitError, match="choose another split"):
-        evaluate(session, [], cup, *networks, [], silent)
+        evaluate(session, [], cup, networks[0], [], silent)
 
 
 def exact(session: Session, cup: ObjectModel, error: float) -> Evaluation:

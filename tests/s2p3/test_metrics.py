@@ -11,8 +11,8 @@ from scipy.spatial import ConvexHull
 
 from dataset import SE3
 from dataset.transforms import rotation_error_deg
-from s2p3.evaluation import metrics
-from s2p3.evaluation.records import metric_name
+from s2p3 import metrics
+from s2p3.metrics import metric_name
 from s2p3.objects import ObjectModel, Symmetry, build
 from tests.s2p3.bop_pose_errors import CASES, STORED, cases, errors
 

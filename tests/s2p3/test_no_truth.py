@@ -15,7 +15,7 @@ import pytest
 from dataset import SE3
 from dataset.session import ObjectPoses, Session, write_poses
 from dataset.session.edit import write_depth
-from s2p3.evaluation import Estimator, Finder, evaluate
+from s2p3.evaluation import Estimator, Finder, evaluate, find_objects
 from s2p3.evaluation.predictions import predictions
 from s2p3.evaluation.shots import session_shots
 from s2p3.objects import ObjectModel
@@ -97,7 +97,8 @@ def test_an_evaluation_compares_with_the_truth_and_shows_it_to_nobody(
     records = []
     for path in (session, lying):
         with Session.open(path) as opened:
-            records.append(evaluate(opened, SHOTS, cup, network, detector, on_step=lambda *_: None).records)
+            found = find_objects(opened, SHOTS, detector, cup.name, lambda *_: None)
+            records.append(evaluate(opened, SHOTS, cup, network, found, lambda *_: None).records)
     true, false = records
     assert [one.T_cam_obj for one in true] == [one.T_cam_obj for one in false]
     assert [one.error_m("ADD") for one in true] != [one.error_m("ADD") for one in false]

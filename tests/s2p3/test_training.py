@@ -46,7 +46,7 @@ from s2p3.training import (
 from s2p3.training.batches import form_input, form_targets
 from s2p3.training.crops import canonical_pose, content_hashes
 from s2p3.training.detection import box_distances, detector_losses
-from s2p3.training.examples import divide
+from s2p3.training.examples import Examples, divide
 from s2p3.training.pretrain import ALL_FRAMES, load_student, load_teacher
 from s2p3.training.pseudo_labels import carry_labels, make_labels
 from s2p3.training.scoring import PoseScorer
@@ -214,6 +214,8 @@ def test_frames_to_validate_on_are_named_by_split_or_session(
         chosen("train", "train")
     with pytest.raises(ToolkitError, match=r"no split 'night' \(its splits: train, val\)"):
         chosen(None, "night")
+    with pytest.raises(ToolkitError, match=r"val\.h5"):
+        Examples.of([session], cup, tiny().input, tiny().student, FrameSource(None, str(tmp_path / "val.h5")))
 
 
 def test_a_true_pose_scores_full_marks(cup_session: Path, crops: LabelledCrops, cup: ObjectModel) -> None:
@@ -337,7 +339,7 @@ def detections(session: Session, cup: ObjectModel) -> list[Detection | None]:
 
 
 def test_captured_crops_hold_no_pose() -> None:
-    assert {field.name for field in fields(Crops)} == {"stokes", "mask", "K", "frames", "depth", "valid"}
+    assert {field.name for field in fields(Crops)} == {"stokes", "mask", "K", "depth", "valid"}
 
 
 def test_carried_labels_match_labels_made_on_the_same_view(

@@ -148,10 +148,13 @@ def adapt_network(study: Study, row: str, seed: int) -> None:
 def judge_network(study: Study, row: str, seed: int, what: str) -> None:
     """Evaluates one row on the set called `what`."""
     model = objects.build(study.name)
-    found = found_in(study, what) if what in CAPTURED_SETS else None
     with Session.open(study.set(what)) as session:
-        network = study.checkpoint(row, seed)
-        run = evaluate(session, range(len(session)), model, network, study.detector, found, _silent)
+        frames, network = range(len(session)), study.checkpoint(row, seed)
+        if what in CAPTURED_SETS:
+            found = found_in(study, what)
+        else:
+            found = find_objects(session, frames, study.detector, study.name, _silent)
+        run = evaluate(session, frames, model, network, found, _silent)
     run.save(study.evaluation(row, seed, what))
 
 

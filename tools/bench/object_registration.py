@@ -26,11 +26,11 @@ from scipy.spatial.transform import Rotation
 from calibration.object_pose import register_points
 from dataset.transforms import SE3, translation_error_mm
 from s2p3 import objects
-from s2p3.evaluation.metrics import rotation_error_deg
 from s2p3.lab.operator import contacts
 from s2p3.lab.rig import BOARD
 from s2p3.lab.scene import board_spec
 from s2p3.lab.truth import sample_truth
+from s2p3.metrics import rotation_error_deg
 
 TOUCHES, STARTS, SAMPLES = 40, 240, 20_000
 

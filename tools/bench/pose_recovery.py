@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from dataset import SE3
-from s2p3.evaluation.metrics import add, add_s
+from s2p3.metrics import add, add_s
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 

@@ -1,11 +1,11 @@
-"""How verbs show progress and print results."""
+"""How long work shows progress on the console, and how results are printed."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -16,6 +16,10 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+if TYPE_CHECKING:
+    from acquisition.recorder import OnProgress
+    from acquisition.recorder import Progress as Recorded
 
 console = Console(stderr=True, highlight=False)
 """For people. Results that a script would read go to stdout."""
@@ -54,6 +58,18 @@ def counting_many(labels: Iterable[str]) -> Iterator[Callable[[str, int, int], N
             if not bar.live.is_started:
                 stack.enter_context(bar)
             bar.update(tasks[label], completed=done, total=total)
+
+        yield report
+
+
+@contextmanager
+def recording(label: str) -> Iterator[OnProgress]:
+    """A progress bar for a recording."""
+    with counting(label) as bar:
+
+        def report(progress: Recorded) -> None:
+            total = round(progress.frames / progress.done) if progress.done else progress.frames
+            bar(progress.frames, max(total, progress.frames))
 
         yield report
 

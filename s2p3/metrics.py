@@ -15,9 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from dataset import SE3
-from s2p3.objects import Symmetry
+from s2p3.objects import ObjectModel, Symmetry
 
 Floats = NDArray[np.float64]
+
+METRIC_POINTS = 1000
+"""Points on the surface over which ADD and ADD-S are averaged."""
 
 SYMMETRY_STEPS = 315
 """Turns about a continuous axis that MSSD and MSPD try: as many as the BOP challenge, ceil(pi / 0.01)."""
@@ -45,6 +48,14 @@ def add_s(estimated: SE3, true: SE3, points: Floats) -> Floats:
     metres."""
     pairs = zip(_placed(estimated, points), _placed(true, points), strict=True)
     return np.array([cKDTree(found).query(wanted)[0].mean() for found, wanted in pairs], dtype=np.float64)
+
+
+ERRORS: dict[str, Callable[[SE3, SE3, Floats], Floats]] = {"ADD": add, "ADD-S": add_s}
+
+
+def metric_name(model: ObjectModel) -> str:
+    """Which of `ERRORS` the object is judged by: ADD-S where it has a symmetry, else ADD."""
+    return "ADD-S" if model.symmetry.any else "ADD"
 
 
 def mssd(estimated: SE3, true: SE3, points: Floats, symmetries: Floats) -> Floats:

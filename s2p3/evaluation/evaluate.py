@@ -137,7 +137,7 @@ def evaluate(
             found = None if detection is None else estimate(stokes, detection, camera, depth)
             true = poses.T_cam_obj[index]
             sight = ruler.sight(index, float(poses.visible_fraction[index]), true)
-            if found is None:
+            if found is None or not found.T_cam_obj.finite:
                 records.append(Record.missed(sight))
             else:
                 box = found.detection.box_xywh

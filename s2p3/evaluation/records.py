@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -127,8 +127,8 @@ class Ruler:
     known_views: Floats
 
     @cached_property
-    def _points(self) -> Floats:
-        return self.model.surface_points(metrics.METRIC_POINTS)
+    def _errors(self) -> dict[str, Callable[[SE3, SE3], Floats]]:
+        return metrics.surface_errors(self.model)
 
     @cached_property
     def _symmetries(self) -> Floats:
@@ -153,8 +153,8 @@ class Ruler:
             box_xywh=tuple(float(value) for value in box_xywh),
             T_cam_obj=tuple(tuple(float(value) for value in row) for row in found.as_matrix()),
             score=float(score),
-            add_m=float(metrics.add(*poses, self._points)[0]),
-            add_s_m=float(metrics.add_s(*poses, self._points)[0]),
+            add_m=float(self._errors["ADD"](*poses)[0]),
+            add_s_m=float(self._errors["ADD-S"](*poses)[0]),
             mssd_m=float(metrics.mssd(*poses, model.vertices, self._symmetries)[0]),
             mspd_px=float(metrics.mspd(*poses, model.vertices, self._symmetries, self.camera.K)[0]),
             rotation_deg=float(metrics.rotation_error_deg(*poses, model.symmetry)[0]),

@@ -40,8 +40,7 @@ class PoseScorer:
 
     @torch.no_grad()
     def __call__(self, network: nn.Module) -> float:
-        points = self.model.surface_points(metrics.METRIC_POINTS)
-        error = metrics.ERRORS[metrics.metric_name(self.model)]
+        error = metrics.surface_errors(self.model)[metrics.metric_name(self.model)]
         errors = []
         for start in range(0, len(self.crops), _CHUNK):
             chosen = torch.arange(start, min(start + _CHUNK, len(self.crops)))
@@ -49,7 +48,7 @@ class PoseScorer:
             true = SE3(
                 *(part[chosen].double().numpy() for part in (self.crops.rotation, self.crops.translation))
             )
-            errors.append(error(estimated, true, points))
+            errors.append(error(estimated, true))
         return metrics.recall(np.concatenate(errors), 0.1 * self.model.diameter)
 
     def _poses(self, network: nn.Module, chosen: torch.Tensor) -> SE3:

@@ -47,6 +47,20 @@ def test_add_s_forgives_a_symmetry_and_never_exceeds_add() -> None:
     assert (metrics.add_s(a, b, POINTS) <= metrics.add(a, b, POINTS) + 1e-12).all()
 
 
+def test_add_s_of_a_symmetric_pose_is_next_to_nothing() -> None:
+    bottle = build("bottle")
+    true = poses(5)
+    turned = true @ SE3.from_rotvec(
+        np.array([[0, 0, angle] for angle in (0.0, 0.7, 1.9, 2.8, 4.1)]), np.zeros((5, 3))
+    )
+    errors = metrics.surface_errors(bottle)
+    assert errors["ADD-S"](turned, true)[0] == pytest.approx(0, abs=1e-12)
+    assert errors["ADD-S"](turned, true).max() < 0.004 * bottle.diameter
+    assert errors["ADD"](turned, true)[1:].min() > 0.1 * bottle.diameter
+    moved = SE3(true.rotation, true.translation + np.array([0, 0, 0.02]))
+    assert (errors["ADD-S"](moved, true) <= errors["ADD"](moved, true)).all()
+
+
 def test_rotation_error_forgives_symmetries() -> None:
     turned = SE3.stack([SE3.from_rotvec(np.array([0, 0, np.radians(30.0)]), np.zeros(3))])
     plain, round_ = Symmetry(), Symmetry(axis=np.array([0.0, 0.0, 1.0]))

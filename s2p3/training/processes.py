@@ -11,6 +11,7 @@ from torch import nn
 
 from dataset.errors import ToolkitError
 from s2p3.training.loader import Share
+from s2p3.training.ranks import is_first
 from s2p3.training.trees import map_tensors
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ class Processes:
     @property
     def first(self) -> bool:
         """Whether this is the process that writes files and speaks."""
-        return self.accelerator.is_main_process
+        return is_first()
 
     @property
     def share(self) -> Share:

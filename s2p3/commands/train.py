@@ -235,7 +235,7 @@ def train_self_supervised(
     """
     if config is not None:
         load(config)  # its values are the options' defaults; here its mistakes are told
-    from s2p3.learning import adapt
+    from s2p3.captured_stages import adapt
     from s2p3.objects import named_object
 
     _use(threads, workers)

@@ -76,7 +76,7 @@ class Processes:
 
         return forward
 
-    def agreed(self, step: int) -> int:
+    def common_step(self, step: int) -> int:
         """The step all processes go on from. Raises ToolkitError: they do not agree."""
         from accelerate.utils import gather_object
 
@@ -88,7 +88,7 @@ class Processes:
             )
         return step
 
-    def spread(self, network: nn.Module) -> None:
+    def broadcast(self, network: nn.Module) -> None:
         """Gives all processes the first one's weights."""
         from accelerate.utils import broadcast
 

@@ -63,7 +63,7 @@ from s2p3.synthesis import (
 )
 from s2p3.synthesis.scene import Backend
 from s2p3.training import captured_crops, self_supervise, train_detector, train_student, train_teacher
-from s2p3.training.adaptation import adapt_batch_norm
+from s2p3.training.batch_norm import adapt_batch_norm
 from s2p3.training.checkpoint import CheckpointInfo, save
 from s2p3.training.pretrain import load_teacher
 

@@ -13,7 +13,18 @@ from typing import Any, TextIO
 import tyro
 
 from dataset.errors import ToolkitError, ToolkitWarning
-from s2p3.commands import calibrate, capture, console, demo, devices, exchange, learn, sessions, train, use
+from s2p3.commands import (
+    calibrate,
+    capture,
+    console,
+    demo,
+    devices,
+    exchange,
+    sessions,
+    synthesize,
+    train,
+    trained_networks,
+)
 from s2p3.commands.experiment import with_defaults
 
 Verb = Callable[..., Any]
@@ -73,7 +84,7 @@ VERBS: dict[str, Verb | Group] = {
         },
     ),
     "decode": sessions.decode,
-    "synthesize": learn.synthesize,
+    "synthesize": synthesize.synthesize,
     "train": Group(
         "Train the networks, on synthetic sessions first, then on captured ones",
         {
@@ -84,9 +95,9 @@ VERBS: dict[str, Verb | Group] = {
             "self-supervised": train.train_self_supervised,
         },
     ),
-    "evaluate": use.evaluate,
-    "predict": use.predict,
-    "export": use.export,
+    "evaluate": trained_networks.evaluate,
+    "predict": trained_networks.predict,
+    "export": trained_networks.export,
 }
 
 _DESCRIPTION = (

@@ -1,9 +1,9 @@
 """How wrong a pose is, and what share of the targets is right.
 
-Errors: ADD (Hinterstoisser et al. 2012) for objects without symmetry and ADD-S (Hodan et al. 2016) for
-objects with one; MSSD and MSPD of the BOP challenge (Hodan et al. 2020), which take the symmetries one by
-one; rotation, translation and signed depth. Poses are T_cam_obj, batches of N; distances in metres. A target
-without an estimate has an infinite error, so that it counts as failed.
+Errors: ADD (Hinterstoisser et al. 2012) for objects without symmetry; for objects with one ADD-S, their ADI,
+named so by Xiang et al. (2018, PoseCNN); MSSD and MSPD of the BOP challenge (Hodan et al. 2020), which take
+the symmetries one by one; rotation, translation and signed depth. Poses are T_cam_obj, batches of N;
+distances in metres. A target without an estimate has an infinite error, so that it counts as failed.
 """
 
 from __future__ import annotations

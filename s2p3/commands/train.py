@@ -240,7 +240,7 @@ def train_self_supervised(
     del preset  # its values, and those of the file, are the options' defaults; here mistakes are told
     if config is not None:
         load(config)
-    from s2p3.learning import adapt
+    from s2p3.captured_stages import adapt
     from s2p3.objects import named_object
 
     _use(threads, workers)

@@ -3,6 +3,7 @@ along."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -42,6 +43,19 @@ def view_window(crops: Crops, indices: Tensor, view: View, config: ExperimentCon
     return inputs.window(view, crops.K[indices], canonical, config.input.canonical_zoom, size)
 
 
+def at_half(mask: Tensor) -> Tensor:
+    """A predicted mask, (B, 1, S, S), as zeros and ones."""
+    return (mask > 0.5).float()
+
+
+def as_predicted(mask: Tensor, generator: torch.Generator) -> Tensor:
+    """A true mask, (B, 1, S, S), made wrong the way a detector's is: blurred, then cut at a random level, so
+    it grows or shrinks."""
+    blurred = F.avg_pool2d(mask, 5, 1, 2)
+    level = 0.2 + 0.6 * torch.rand(len(mask), 1, 1, 1, generator=generator)
+    return (blurred > level).float()
+
+
 def form_input(
     crops: Crops,
     indices: Tensor,
@@ -49,13 +63,13 @@ def form_input(
     refractive_index: float,
     config: ExperimentConfig,
     augment: torch.Generator | None = None,
-    degrade_mask: bool = False,
+    cut: Callable[[Tensor], Tensor] = at_half,
 ) -> NetworkInput:
     """The network input of the chosen crops, seen through `view`.
 
     Args:
         augment: with a generator, photometric augmentation is applied.
-        degrade_mask: whether `crops.mask` is the truth and must be made as imperfect as a predicted one.
+        cut: makes zeros and ones of the masks; those that are the truth are cut `as_predicted`.
     """
     window = view_window(crops, indices, view, config, config.input.size)
     stokes = inputs.rotate_stokes(window.resample(crops.stokes[indices].float()), view.angle)
@@ -64,8 +78,7 @@ def form_input(
         stokes = inputs.augment_photometry(stokes, config.augmentation, augment)
     mask = None
     if config.input.background == "mask":
-        mask = window.resample(crops.mask[indices].float(), padding="zeros")
-        mask = _degrade(mask, augment) if degrade_mask and augment is not None else (mask > 0.5).float()
+        mask = cut(window.resample(crops.mask[indices].float(), padding="zeros"))
     depth = None
     if crops.depth is not None:
         depth = window.resample(crops.depth[indices].float(), mode="nearest", padding="zeros")
@@ -100,11 +113,3 @@ def turn_vectors(rotation: Tensor, vectors: Tensor) -> Tensor:
 def turn_maps(rotation: Tensor, maps: Tensor) -> Tensor:
     """(B, 3, 3) applied to the vectors of maps (B, 3, h, w)."""
     return torch.einsum("bij,bjhw->bihw", rotation, maps)
-
-
-def _degrade(mask: Tensor, generator: torch.Generator) -> Tensor:
-    """A true mask made wrong the way a detector's is: blurred, then cut at a random level, so it grows or
-    shrinks."""
-    blurred = F.avg_pool2d(mask, 5, 1, 2)
-    level = 0.2 + 0.6 * torch.rand(len(mask), 1, 1, 1, generator=generator)
-    return (blurred > level).float()

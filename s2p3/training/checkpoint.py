@@ -20,6 +20,7 @@ from dataset.errors import ToolkitError
 from s2p3.config import ExperimentConfig
 from s2p3.objects import SAME_SIZE, ObjectModel
 from s2p3.provenance import toolkit_state
+from s2p3.training.ranks import have_met, is_first
 
 Kind = Literal["teacher", "student", "detector"]
 Network = TypeVar("Network", bound=nn.Module)
@@ -126,8 +127,7 @@ def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
 
     Of several processes that train together the first one writes, and the others wait for it.
     """
-    together = dist.is_available() and dist.is_initialized()
-    if not together or dist.get_rank() == 0:
+    if is_first():
         path.parent.mkdir(parents=True, exist_ok=True)
         description = {"format": FORMAT, **asdict(info), "config": typed_toml.dumps(info.config)}
         text = json.dumps(description, indent=1)
@@ -135,7 +135,7 @@ def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
         save_tensors(path, weights, {_DESCRIPTION: text})
         shutil.copymode(path.with_suffix(".json"), path)  # safetensors writes for the owner only
         path.with_suffix(RESUME).unlink(missing_ok=True)
-    if together:
+    if have_met():
         dist.barrier()
 
 

@@ -125,7 +125,7 @@ def optimize(
         network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
     )
     state = State(path.with_suffix(RESUME), run, network, average, optimizer)
-    first = processes.agreed(state.restore())
+    first = processes.common_step(state.restore())
     forward = processes.prepare(network)
     batches = stream(Steps(data, settings.batch, settings.seed, processes.share), first, steps, workers)
     started = time.perf_counter()
@@ -161,7 +161,7 @@ def optimize(
     best = state.best
     if best is not None:
         average.load_state_dict(best.weights)
-    processes.spread(average)
+    processes.broadcast(average)
     average = average.cpu().eval()
     return Trained(average, steps) if best is None else Trained(average, best.step, best.score)
 

@@ -7,7 +7,6 @@ the signal. A set without signal can be trained on; but then L_physics cannot he
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -24,6 +23,7 @@ from s2p3.rendering.differentiable import RenderMesh, render
 from s2p3.synthesis.informativeness import Informativeness, measure
 from s2p3.training.crops import Crops, LabelledCrops
 from s2p3.training.examples import CropSource
+from s2p3.training.ranks import is_first
 
 _MEASURED = 64  # crops at most, spread over the set
 _HARDLY_LESS = 0.9  # our choice: an error this close to chance is none the better
@@ -76,7 +76,7 @@ def objection(figures: Informativeness, physics: PhysicsVariant = "dolp") -> str
 def report_signal(figures: Informativeness, beside: Path, physics: PhysicsVariant) -> None:
     """Keeps the figures as NAME.signal.json beside a checkpoint to be, and warns where they say nothing to a
     training with this variant of L_physics. Of several processes that train together the first one does."""
-    if int(os.environ.get("RANK", "0")):
+    if not is_first():
         return
     beside.parent.mkdir(parents=True, exist_ok=True)
     beside.with_suffix(".signal.json").write_text(figures.to_json() + "\n", encoding="utf-8")

@@ -7,6 +7,7 @@ teacher's dense losses (`dense_weight`) and the warm start are our choice; `s2p3
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +26,7 @@ from s2p3.networks.student import Student
 from s2p3.networks.teacher import Teacher, TeacherOutput, pose_of
 from s2p3.objects import ObjectModel
 from s2p3.training import checkpoint
-from s2p3.training.batches import Targets, form_input, form_targets
+from s2p3.training.batches import Targets, as_predicted, form_input, form_targets
 from s2p3.training.checkpoint import CheckpointInfo, Kind, Validation
 from s2p3.training.examples import CropSource, Examples
 from s2p3.training.loop import Forward, Losses, Objective, Score, optimize
@@ -219,9 +220,8 @@ class LabelledData:
     def __call__(self, rows: Tensor, generator: torch.Generator) -> LabelledBatch:
         crops, every = self.source.take(self.rows[rows]), torch.arange(len(rows))
         view = View.random(len(rows), self.config.augmentation, generator)
-        seen = form_input(
-            crops, every, view, self.refractive_index, self.config, generator, degrade_mask=True
-        )
+        cut = functools.partial(as_predicted, generator=generator)
+        seen = form_input(crops, every, view, self.refractive_index, self.config, generator, cut)
         return LabelledBatch(seen, form_targets(crops, every, view, self.config))
 
 

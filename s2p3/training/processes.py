@@ -11,6 +11,7 @@ from torch import nn
 
 from dataset.errors import ToolkitError
 from s2p3.training.loader import Share
+from s2p3.training.ranks import is_first
 from s2p3.training.trees import map_tensors
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ class Processes:
     @property
     def first(self) -> bool:
         """Whether this is the process that writes files and speaks."""
-        return self.accelerator.is_main_process
+        return is_first()
 
     @property
     def share(self) -> Share:
@@ -75,7 +76,7 @@ class Processes:
 
         return forward
 
-    def agreed(self, step: int) -> int:
+    def common_step(self, step: int) -> int:
         """The step all processes go on from. Raises ToolkitError: they do not agree."""
         from accelerate.utils import gather_object
 
@@ -87,7 +88,7 @@ class Processes:
             )
         return step
 
-    def spread(self, network: nn.Module) -> None:
+    def broadcast(self, network: nn.Module) -> None:
         """Gives all processes the first one's weights."""
         from accelerate.utils import broadcast
 

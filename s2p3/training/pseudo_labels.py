@@ -1,6 +1,6 @@
 """What the teacher says about captured crops: poses, masks, normals, and how far to trust them.
 
-A frozen teacher is run once over the upright crops; its answers are carried along with the augmentation,
+A frozen teacher is run once over the upright crops; its answers are warped along with the augmentation,
 exactly for in-plane rotation, instead of running it on every augmented crop (our choice). A teacher that
 follows its student answers on each batch.
 """
@@ -78,7 +78,7 @@ def make_labels(
 
 
 @torch.no_grad()
-def carry_labels(
+def warp_labels(
     labels: PseudoLabels,
     crops: Crops,
     indices: Tensor,

@@ -28,7 +28,7 @@ from s2p3.networks.teacher import pose_of
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
-from s2p3.training.adaptation import freeze_norms
+from s2p3.training.batch_norm import freeze_norms
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
 from s2p3.training.loop import Forward, Losses, optimize

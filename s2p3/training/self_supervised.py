@@ -24,7 +24,7 @@ from s2p3.networks.teacher import MAP_STRIDE, Teacher, TeacherOutput, pose_of
 from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
-from s2p3.training.adaptation import adapt_batch_norm, freeze_norms, set_momentum
+from s2p3.training.batch_norm import adapt_batch_norm, freeze_norms, set_momentum
 from s2p3.training.batches import form_input
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
@@ -33,7 +33,7 @@ from s2p3.training.mean_teacher import MeanTeacher
 from s2p3.training.physics_signal import captured_signal, report_signal
 from s2p3.training.pretrain import load_student, load_teacher, model_tensors
 from s2p3.training.progress import OnStep
-from s2p3.training.pseudo_labels import PseudoLabels, carry_labels, labels_of, make_labels, pooled_maps
+from s2p3.training.pseudo_labels import PseudoLabels, labels_of, make_labels, pooled_maps, warp_labels
 
 _BATCH_NORM_MOMENTUM = 0.02
 
@@ -158,7 +158,7 @@ class CapturedData:
     def __call__(self, rows: Tensor, generator: torch.Generator) -> CapturedBatch:
         view = View.random(len(rows), self.config.augmentation, generator)
         seen = form_input(self.crops, rows, view, self.refractive_index, self.config, generator)
-        return CapturedBatch(seen, carry_labels(self.labels, self.crops, rows, view, self.mesh, self.config))
+        return CapturedBatch(seen, warp_labels(self.labels, self.crops, rows, view, self.mesh, self.config))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Labels made once on upright crops, and carried along with every view of them."""
+"""Labels made once on upright crops, and warped along with every view of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from s2p3.objects import ObjectModel
 from s2p3.rendering.differentiable import RenderMesh, render
 from s2p3.training import LabelledCrops, labelled_crops
 from s2p3.training.batches import view_window
-from s2p3.training.pseudo_labels import PseudoLabels, carry_labels, pooled_maps
+from s2p3.training.pseudo_labels import PseudoLabels, pooled_maps, warp_labels
 
 EVERY = torch.arange(8)
 
@@ -45,20 +45,20 @@ def test_labels_carried_into_a_view_are_those_rendered_in_it(
     """Maps that were turned, shifted and scaled against a rendering at the pose turned by hand."""
     mesh, size = RenderMesh.from_mesh(cup.mesh), experiment.input.size
     view = View(torch.full((8,), 1.25), torch.tensor([[0.1, -0.06]]).expand(8, 2), torch.full((8,), angle))
-    carried = carry_labels(true_labels(crops, mesh, experiment), crops, EVERY, view, mesh, experiment)
+    warped = warp_labels(true_labels(crops, mesh, experiment), crops, EVERY, view, mesh, experiment)
     cos, sin = float(view.angle[0].cos()), float(view.angle[0].sin())
     turn = torch.tensor([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])  # about z: x towards y
     rotation, translation = turn @ crops.rotation, crops.translation @ turn.T
-    torch.testing.assert_close(carried.rotation, rotation)
-    torch.testing.assert_close(carried.translation, translation)
+    torch.testing.assert_close(warped.rotation, rotation)
+    torch.testing.assert_close(warped.translation, translation)
     K = view_window(crops, EVERY, view, experiment, size).K
     mask, normals = pooled_maps(render(mesh, rotation, translation, K, size, size, silhouette=False))
-    torch.testing.assert_close(carried.rendered_mask, mask)
-    seen, true = carried.mask > 0.5, mask > 0.5
+    torch.testing.assert_close(warped.rendered_mask, mask)
+    seen, true = warped.mask > 0.5, mask > 0.5
     overlap = (seen & true).sum((1, 2, 3)) / (seen | true).sum((1, 2, 3))
     assert overlap.min() > 0.9
-    inside = ((carried.mask > 0.99) & (mask > 0.99))[:, 0]
-    apart = (carried.normals * normals).sum(1).clamp(-1, 1).acos().rad2deg()[inside]
+    inside = ((warped.mask > 0.99) & (mask > 0.99))[:, 0]
+    apart = (warped.normals * normals).sum(1).clamp(-1, 1).acos().rad2deg()[inside]
     assert inside.sum() > 200
     assert apart.median() < 1.5
 

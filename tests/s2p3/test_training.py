@@ -48,7 +48,7 @@ from s2p3.training.crops import canonical_pose, content_hashes
 from s2p3.training.detection import box_distances, detector_losses
 from s2p3.training.examples import Examples, divide
 from s2p3.training.pretrain import ALL_FRAMES, load_student, load_teacher
-from s2p3.training.pseudo_labels import carry_labels, make_labels
+from s2p3.training.pseudo_labels import make_labels, warp_labels
 from s2p3.training.scoring import PoseScorer
 
 
@@ -342,7 +342,7 @@ def test_captured_crops_hold_no_pose() -> None:
     assert {field.name for field in fields(Crops)} == {"stokes", "mask", "K", "depth", "valid"}
 
 
-def test_carried_labels_match_labels_made_on_the_same_view(
+def test_warped_labels_match_labels_made_on_the_same_view(
     crops: LabelledCrops, trained: Path, cup: ObjectModel
 ) -> None:
     experiment = tiny()
@@ -350,7 +350,7 @@ def test_carried_labels_match_labels_made_on_the_same_view(
     mesh = RenderMesh.from_mesh(cup.mesh)
     labels = make_labels(teacher, crops, cup, mesh, experiment)
     view = View.centred(8, experiment.input.zoom)
-    same = carry_labels(labels, crops, torch.arange(8), view, mesh, experiment)
+    same = warp_labels(labels, crops, torch.arange(8), view, mesh, experiment)
     torch.testing.assert_close(same.rendered_mask, labels.rendered_mask, atol=1e-3, rtol=0)
     torch.testing.assert_close(same.mask, labels.mask, atol=1e-4, rtol=0)
     torch.testing.assert_close(same.rotation, labels.rotation)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from plan import ADABN, ADAPTED_TEACHER, BEFORE, DISTILLED, DOLP, TEACHER, WITHOUT_PHYSICS
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "adaptation"
@@ -29,15 +30,7 @@ The rows: networks *before*; with BatchNorm statistics re-estimated on captured 
 that only copies the poses of the teacher (*pose-only distillation*); one that learns from its maps, too
 (*without physics*); and the whole method, with the paper's physics or with ours.
 """
-METHOD = "student, DoLP physics (the paper's)"
-CONTROLS = (
-    "student before",
-    "student, AdaBN alone",
-    "teacher",
-    "teacher, AdaBN alone",
-    "student, pose-only distillation",
-    "student, without physics",
-)
+CONTROLS = (BEFORE, ADABN, TEACHER, ADAPTED_TEACHER, DISTILLED, WITHOUT_PHYSICS)
 """What the adapted students are compared with."""
 
 
@@ -126,18 +119,18 @@ def _summary(differences: dict[str, dict[str, list[dict[str, float]]]]) -> str:
     """What the paper's method gains, in a sentence."""
 
     def gain(other: str) -> str:
-        found = differences[METHOD][other]
+        found = differences[DOLP][other]
         clear = sum(each["low"] > 0 for each in found)
         mean = np.mean([each["value"] for each in found])
         return f"{mean:+.1f} points against *{other}* (interval above zero for {clear} of {len(found)} seeds)"
 
-    others = [gain(other) for other in ("student before", "teacher", "student, without physics")]
+    others = [gain(other) for other in (BEFORE, TEACHER, WITHOUT_PHYSICS)]
     return f"The paper's method, in the mean over seeds: {'; '.join(others)}."
 
 
 def _in_domain(sets: dict[str, dict[str, list[dict[str, Any]]]]) -> list[str]:
     """Each held-out set, and where there are two, both together."""
-    networks = ("teacher", "student before")
+    networks = (TEACHER, BEFORE)
     found = {name: [rows[row] for row in networks] for name, rows in sets.items()}
     if len(sets) > 1:
         found["together"] = [_pooled(*(rows[row] for rows in sets.values())) for row in networks]

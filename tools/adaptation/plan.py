@@ -13,24 +13,32 @@ from s2p3.training.checkpoint import read_info
 TRACED_SEED, ANALYTIC_SEED, HELD_OUT_SEED = 0, 1, 2
 TRACED_HELD_OUT, ANALYTIC_HELD_OUT = 60, 300  # frames
 DETECTOR_FRAMES, DETECTOR_SEED = 1800, 3
-CAPTURED_SETS = {"captured": (1920, 100), "captured-val": (280, 101), "captured-test": (1000, 102)}
+ADAPTED_TO, VALIDATION, TEST = "captured", "captured-val", "captured-test"
+CAPTURED_SETS = {ADAPTED_TO: (1920, 100), VALIDATION: (280, 101), TEST: (1000, 102)}
 """Frames and seed of the set to adapt to and of those to judge by."""
 
 Change = Callable[[SelfSupervisionConfig], SelfSupervisionConfig]
 
-ADABN = SelfSupervisionConfig().adapt_batches
+BEFORE, TEACHER, ADAPTED_TEACHER = "student before", "teacher", "teacher, AdaBN alone"
+ADABN = "student, AdaBN alone"
+DISTILLED = "student, pose-only distillation"
+WITHOUT_PHYSICS = "student, without physics"
+DOLP = "student, DoLP physics (the paper's)"
+STOKES = "student, Stokes physics (ours)"
+"""The rows' names; folders and results on disk go by them."""
+
+_ADABN_BATCHES = SelfSupervisionConfig().adapt_batches
 TRAINED: dict[str, Change] = {
-    "student, AdaBN alone": lambda settings: replace(settings, steps=0, epochs=0, adapt_batches=ADABN),
-    "student, pose-only distillation": lambda settings: replace(
+    ADABN: lambda settings: replace(settings, steps=0, epochs=0, adapt_batches=_ADABN_BATCHES),
+    DISTILLED: lambda settings: replace(
         settings, pose_weight=1.0, mask_weight=0.0, normals_weight=0.0, physics="none"
     ),
-    "student, without physics": lambda settings: replace(settings, physics="none"),
-    "student, DoLP physics (the paper's)": lambda settings: replace(settings, physics="dolp"),
-    "student, Stokes physics (ours)": lambda settings: replace(settings, physics="stokes"),
+    WITHOUT_PHYSICS: lambda settings: replace(settings, physics="none"),
+    DOLP: lambda settings: replace(settings, physics="dolp"),
+    STOKES: lambda settings: replace(settings, physics="stokes"),
 }
 """The rows that start from the pre-trained student, and how each departs from the object's settings."""
 
-BEFORE, TEACHER, ADAPTED_TEACHER = "student before", "teacher", "teacher, AdaBN alone"
 ROWS = (BEFORE, TEACHER, ADAPTED_TEACHER, *TRAINED)
 """All rows, in the table's order."""
 

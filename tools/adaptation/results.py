@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plan import BEFORE, ROWS, TEACHER, TRAINED, Study
+from plan import ADABN, BEFORE, ROWS, TEACHER, TRAINED, Study
 
 from s2p3.evaluation import Evaluation
 from s2p3.training.checkpoint import read_info
@@ -27,7 +27,7 @@ def minutes_of(study: Study) -> dict[str, float]:
         logs = [path.with_suffix(".log.jsonl") for path in checkpoints]
         return round(float(np.mean([seconds(log) for log in logs])) / 60, 1)
 
-    trained = [row for row in TRAINED if row != "student, AdaBN alone"]
+    trained = [row for row in TRAINED if row != ADABN]
     lines = study.rendered.read_text(encoding="utf-8").splitlines() if study.rendered.exists() else []
     sets = sum(int(workers) * float(spent) for _, workers, spent in (line.split("\t") for line in lines))
     return {
@@ -78,7 +78,5 @@ def result_of(study: Study) -> dict[str, Any]:
         "in_domain": {
             name: {row: figures(row, name) for row in (TEACHER, BEFORE)} for name in study.held_out()
         },
-        "differences": {
-            row: {other: above(row, other) for other in ROWS if other != row} for row in ROWS[3:]
-        },
+        "differences": {row: {other: above(row, other) for other in ROWS if other != row} for row in TRAINED},
     }

@@ -29,6 +29,7 @@ import torch
 from page import RESULTS, table, write_page
 from plan import (
     ADAPTED_TEACHER,
+    ADAPTED_TO,
     ANALYTIC_HELD_OUT,
     ANALYTIC_SEED,
     BEFORE,
@@ -38,9 +39,11 @@ from plan import (
     HELD_OUT_SEED,
     ROWS,
     TEACHER,
+    TEST,
     TRACED_HELD_OUT,
     TRACED_SEED,
     TRAINED,
+    VALIDATION,
     Study,
     check_settings,
 )
@@ -63,7 +66,7 @@ from s2p3.synthesis import (
 )
 from s2p3.synthesis.scene import Backend
 from s2p3.training import captured_crops, self_supervise, train_detector, train_student, train_teacher
-from s2p3.training.adaptation import adapt_batch_norm
+from s2p3.training.batch_norm import adapt_batch_norm
 from s2p3.training.checkpoint import CheckpointInfo, save
 from s2p3.training.pretrain import load_teacher
 
@@ -94,13 +97,10 @@ def make_sets(study: Study, workers: int) -> None:
 
 
 def train_network(study: Study, what: str, seed: int) -> None:
-    """Pre-trains a teacher, a student, or the detector, which then looks at the captured sets."""
+    """Pre-trains a teacher, a student, or the detector."""
     config, model, cache = study.experiment(seed), objects.build(study.name), study.out / "crops"
     if what == "detector":
-        if not study.detector.exists():
-            train_detector([study.detector_set], model, config, study.detector.parent, _silent)
-        for name in CAPTURED_SETS:
-            find_captured(study, name)
+        train_detector([study.detector_set], model, config, study.detector.parent, _silent)
     elif what == TEACHER:
         out = study.checkpoint(TEACHER, seed).parent
         train_teacher(study.training_sets(), model, config, out, cache, _silent)
@@ -117,7 +117,9 @@ def find_captured(study: Study, name: str) -> None:
     masks = [np.zeros(shape, bool) if one is None else one.mask for one in found]
     boxes = [np.zeros(4) if one is None else one.box_xywh for one in found]
     scores = [np.nan if one is None else one.score for one in found]
-    np.savez_compressed(study.found(name), mask=np.packbits(masks, axis=-1), box=boxes, score=scores)
+    part = study.found(name).with_suffix(".part.npz")
+    np.savez_compressed(part, mask=np.packbits(masks, axis=-1), box=boxes, score=scores)
+    part.replace(study.found(name))
 
 
 def found_in(study: Study, name: str) -> list[Detection | None]:
@@ -132,8 +134,8 @@ def found_in(study: Study, name: str) -> list[Detection | None]:
 def adapt_network(study: Study, row: str, seed: int) -> None:
     """Trains one row on the captured set to adapt to; no pose is read."""
     config, model = study.experiment(seed), objects.build(study.name)
-    with Session.open(study.set("captured")) as session:
-        crops = captured_crops(session, range(len(session)), found_in(study, "captured"), config.input)
+    with Session.open(study.set(ADAPTED_TO)) as session:
+        crops = captured_crops(session, range(len(session)), found_in(study, ADAPTED_TO), config.input)
     teacher, student = study.checkpoint(TEACHER, seed), study.checkpoint(BEFORE, seed)
     path, settings = study.checkpoint(row, seed), config.self_supervision
     if row == ADAPTED_TEACHER:
@@ -177,13 +179,13 @@ def run_study(study: Study, workers: int) -> None:
     """Every step whose file is missing."""
     study.out.mkdir(parents=True, exist_ok=True)
     check_settings(study)
-    last = study.found(list(CAPTURED_SETS)[-1])
-    guides: list[Job] = [(last, train_network, (study, "detector", study.seeds[0]))]
-    students: list[Job] = []  # they may start from their teacher's encoders
+    guides: list[Job] = [(study.detector, train_network, (study, "detector", study.seeds[0]))]
+    # with the detector's answers come the students: they may start from their teacher's encoders
+    guided: list[Job] = [(study.found(name), find_captured, (study, name)) for name in CAPTURED_SETS]
     adaptation: list[Job] = []
     evaluation: list[Job] = []
     for seed in study.seeds:
-        for jobs, row in ((guides, TEACHER), (students, BEFORE)):
+        for jobs, row in ((guides, TEACHER), (guided, BEFORE)):
             jobs.append((study.checkpoint(row, seed), train_network, (study, row, seed)))
         for row in (ADAPTED_TEACHER, *TRAINED):
             adaptation.append((study.checkpoint(row, seed), adapt_network, (study, row, seed)))
@@ -193,7 +195,7 @@ def run_study(study: Study, workers: int) -> None:
             evaluation.append((study.evaluation(row, seed, what), judge_network, (study, row, seed, what)))
     make_sets(study, workers)
     run_all(guides, workers)
-    run_all(students, workers)
+    run_all(guided, workers)
     run_all(adaptation, workers)
     run_all(evaluation, workers)
 
@@ -208,9 +210,7 @@ def main() -> int:
     parser.add_argument("--domain", choices=("plain", "synthetic"), default="plain", help="trained on")
     parser.add_argument("--traced", type=int, default=400, help="path-traced frames to train on")
     parser.add_argument("--analytic", type=int, default=3600, help="analytic frames to train on")
-    parser.add_argument(
-        "--judged", choices=tuple(CAPTURED_SETS)[1:], default="captured-test", help="captured set to judge by"
-    )
+    parser.add_argument("--judged", choices=(VALIDATION, TEST), default=TEST, help="captured set to judge by")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     study = Study(
@@ -225,7 +225,7 @@ def main() -> int:
     run_study(study, options.workers)
     result = result_of(study)
     print(table(result))
-    if options.judged == "captured-test":
+    if options.judged == TEST:
         publish(f"{study.name}-{study.domain}", result)
     return 0
 

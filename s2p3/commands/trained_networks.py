@@ -46,10 +46,10 @@ def evaluate(
     """
     from dataclasses import asdict
 
+    from s2p3.captured_stages import evaluate_split
     from s2p3.evaluation import Evaluation
     from s2p3.evaluation.evaluate import finite
     from s2p3.evaluation.files import check_out, told_apart, write_files
-    from s2p3.learning import evaluate_split
     from s2p3.objects import named_object
 
     at_least(0, scene_id=scene_id)

@@ -13,9 +13,9 @@ from dataset.errors import SessionError, ToolkitError
 from dataset.session import Session, write_split
 from dataset.validate import validate
 from s2p3 import config as presets
+from s2p3.captured_stages import adapt, frames_of
 from s2p3.cli import main
 from s2p3.evaluation import Evaluation
-from s2p3.learning import adapt, frames_of
 from s2p3.objects import build
 from s2p3.training.checkpoint import read_info
 

@@ -75,7 +75,8 @@ def write_page() -> None:
         kept = json.loads(path.read_text(encoding="utf-8"))
         parts += [
             f"## {_title(path.stem)}\n",
-            f"`{kept['command']}`, {kept['date']}; {_commits(kept['result']['rows'])}\n",
+            f"`{kept['command']}` at `{kept['commit']}`, {kept['date']}; "
+            f"{_commits(kept['result']['rows'])}\n",
             table(kept["result"]),
         ]
     PAGE.write_text("\n".join(parts), encoding="utf-8")

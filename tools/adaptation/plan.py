@@ -79,6 +79,11 @@ class Study:
     def set(self, name: str) -> Path:
         return self.out / f"{name}.h5"
 
+    @property
+    def captured(self) -> dict[str, tuple[int, int]]:
+        """Frames and seed of the captured sets in use: while settings are tuned there is no test set yet."""
+        return {name: CAPTURED_SETS[name] for name in (ADAPTED_TO, self.judged)}
+
     def found(self, name: str) -> Path:
         """The detector's answers for a captured set: every row of every seed sees the same."""
         return self.detector.with_name(f"{name}.npz")

@@ -33,7 +33,6 @@ from plan import (
     ANALYTIC_HELD_OUT,
     ANALYTIC_SEED,
     BEFORE,
-    CAPTURED_SETS,
     DETECTOR_FRAMES,
     DETECTOR_SEED,
     HELD_OUT_SEED,
@@ -75,7 +74,7 @@ def make_sets(study: Study, workers: int) -> None:
     """Renders the sets that are missing."""
     trained_on = DOMAINS[study.domain]
     makers: list[tuple[Path, int, int, Domain, Backend]] = [
-        (study.set(name), count, seed, CAPTURED, Analytic()) for name, (count, seed) in CAPTURED_SETS.items()
+        (study.set(name), count, seed, CAPTURED, Analytic()) for name, (count, seed) in study.captured.items()
     ]
     makers.append((study.detector_set, DETECTOR_FRAMES, DETECTOR_SEED, SYNTHETIC, Analytic()))
     backends: dict[str, tuple[Backend, int, int, int]] = {}
@@ -152,7 +151,7 @@ def judge_network(study: Study, row: str, seed: int, what: str) -> None:
     model = objects.build(study.name)
     with Session.open(study.set(what)) as session:
         frames, network = range(len(session)), study.checkpoint(row, seed)
-        if what in CAPTURED_SETS:
+        if what in study.captured:
             found = found_in(study, what)
         else:
             found = find_objects(session, frames, study.detector, study.name, _silent)
@@ -181,7 +180,7 @@ def run_study(study: Study, workers: int) -> None:
     check_settings(study)
     guides: list[Job] = [(study.detector, train_network, (study, "detector", study.seeds[0]))]
     # with the detector's answers come the students: they may start from their teacher's encoders
-    guided: list[Job] = [(study.found(name), find_captured, (study, name)) for name in CAPTURED_SETS]
+    guided: list[Job] = [(study.found(name), find_captured, (study, name)) for name in study.captured]
     adaptation: list[Job] = []
     evaluation: list[Job] = []
     for seed in study.seeds:

@@ -13,6 +13,7 @@ from s2p3.config import Self6DConfig, SelfSupervisionConfig
 from s2p3.evaluation import Estimator, Evaluation, evaluate, find_objects
 from s2p3.evaluation.evaluate import targets_of
 from s2p3.objects import ObjectModel, poses_of
+from s2p3.progress import Report, quiet
 from s2p3.training import captured_crops, self_supervise, self_supervise_rgbd
 from s2p3.training.checkpoint import to_write
 from s2p3.training.crops import depth_of
@@ -28,13 +29,16 @@ def adapt(
     student: Path,
     out: Path,
     settings: SelfSupervisionConfig | Self6DConfig | None = None,
+    *,
     workers: int = 0,
+    report: Report = quiet,
 ) -> Path:
     """Self-supervised training of a student on a split of captured frames; no pose of the session is read.
 
     Args:
         settings: of the paper's method, as the student's experiment has them when None, or of the RGB-D
             baseline.
+        workers, report: see `loop.Run`.
 
     Returns:
         `out`/adapted.safetensors.
@@ -48,15 +52,21 @@ def adapt(
     with Session.open(session) as opened:
         indices = frames_of(opened, split)
         depth_of(opened, indices[0], config.input)
-        detections = find_objects(opened, indices, detector, model.name)
+        detections = find_objects(opened, indices, detector, model.name, report)
         crops = captured_crops(opened, indices, detections, config.input)
+    common = (crops, model, teacher, student, out)
     if isinstance(settings, Self6DConfig):
-        return self_supervise_rgbd(crops, model, teacher, student, out, settings, workers=workers)
-    return self_supervise(crops, model, teacher, student, out, settings, workers=workers)
+        return self_supervise_rgbd(*common, settings, workers=workers, report=report)
+    return self_supervise(*common, settings, workers=workers, report=report)
 
 
 def evaluate_split(
-    session: Path, split: str, model: ObjectModel, networks: Mapping[str, Path], detector: Path
+    session: Path,
+    split: str,
+    model: ObjectModel,
+    networks: Mapping[str, Path],
+    detector: Path,
+    report: Report = quiet,
 ) -> dict[str, Evaluation]:
     """Evaluates networks on a split of an annotated session, in the same detected boxes; see
     `evaluation.evaluate`.
@@ -70,8 +80,11 @@ def evaluate_split(
         targets_of(opened, indices, poses_of(opened, model), model.name)
         for network in networks.values():
             Estimator.load(network, model)  # a mistake is told before the detector has run
-        found = find_objects(opened, indices, detector, model.name)
-        return {name: evaluate(opened, indices, model, network, found) for name, network in networks.items()}
+        found = find_objects(opened, indices, detector, model.name, report)
+        return {
+            name: evaluate(opened, indices, model, network, found, report)
+            for name, network in networks.items()
+        }
 
 
 def frames_of(session: Session, split: str) -> list[int]:

@@ -17,6 +17,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from s2p3.progress import Report
+
 if TYPE_CHECKING:
     from acquisition.recorder import OnProgress
     from acquisition.recorder import Progress as Recorded
@@ -33,13 +35,14 @@ def say(text: str) -> None:
 @contextmanager
 def counting(label: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar with an ETA; call the yielded function with (done, in all)."""
-    with counting_many((label,)) as report:
-        yield lambda done, total: report(label, done, total)
+    with progress_bars((label,)) as report:
+        yield lambda done, total: report(label, done, total, {})
 
 
 @contextmanager
-def counting_many(labels: Iterable[str]) -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar with an ETA for each label; call the yielded function with (label, done, in all).
+def progress_bars(labels: Iterable[str] = ()) -> Iterator[Report]:
+    """A progress bar with an ETA for each of these labels, and for every other that the yielded function is
+    called with.
 
     Nothing is shown before the first call: a mistake found until then is told in one line.
     """
@@ -49,15 +52,19 @@ def counting_many(labels: Iterable[str]) -> Iterator[Callable[[str, int, int], N
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
+        TextColumn("{task.fields[loss]}"),
     )
-    bar = Progress(*columns, console=console)
-    tasks = {label: bar.add_task(label, total=None) for label in labels}
+    bars = Progress(*columns, console=console)
+    tasks = {label: bars.add_task(label, total=None, loss="") for label in labels}
     with ExitStack() as stack:
 
-        def report(label: str, done: int, total: int) -> None:
-            if not bar.live.is_started:
-                stack.enter_context(bar)
-            bar.update(tasks[label], completed=done, total=total)
+        def report(label: str, done: int, total: int, values: Mapping[str, float]) -> None:
+            if not bars.live.is_started:
+                stack.enter_context(bars)
+            if label not in tasks:
+                tasks[label] = bars.add_task(label, total=total, loss="")
+            loss = f"loss {values['total']:.3f}" if "total" in values else ""
+            bars.update(tasks[label], completed=done, total=total, loss=loss)
 
         yield report
 

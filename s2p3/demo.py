@@ -36,7 +36,7 @@ from s2p3 import objects
 from s2p3.annotation import annotate
 from s2p3.captured_stages import adapt, evaluate_split
 from s2p3.config import PRESETS
-from s2p3.console_output import counting, recording, say
+from s2p3.console_output import counting, progress_bars, recording, say
 from s2p3.demo_report import compare, write_report
 from s2p3.evaluation import Evaluation
 from s2p3.lab import LabTruth, Operator, RunningLab, found_lab, running_lab
@@ -251,11 +251,13 @@ class Demo:
     def self_supervise(self) -> None:
         if not self.adapted.exists():
             networks = (self.detector, self.teacher, self.student)
-            adapt(self.sequence, "train", self.model, *networks, self.adapted.parent)
+            with progress_bars() as report:
+                adapt(self.sequence, "train", self.model, *networks, self.adapted.parent, report=report)
 
     def evaluate(self) -> None:
         networks = {"teacher": self.teacher, "before": self.student, "after": self.adapted}
-        runs = evaluate_split(self.sequence, "test", self.model, networks, self.detector)
+        with progress_bars() as report:
+            runs = evaluate_split(self.sequence, "test", self.model, networks, self.detector, report)
         for name, run in runs.items():
             run.save(self._evaluation(name))
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataset.errors import ToolkitError
-from s2p3.console_output import counting_many
+from s2p3.console_output import progress_bars
 
 _POLL_S = 1.0
 _TAIL_BYTES = 4096
@@ -55,7 +55,7 @@ def run_side_by_side(trainings: Mapping[str, Training]) -> None:
     """
     running: dict[str, subprocess.Popen[bytes]] = {}
     done: set[str] = set()
-    with counting_many(trainings) as report, ExitStack() as stack:
+    with progress_bars(trainings) as report, ExitStack() as stack:
         while len(done) < len(trainings):
             for name, training in trainings.items():
                 if name not in running and (training.after in done or training.after not in trainings):
@@ -67,7 +67,7 @@ def run_side_by_side(trainings: Mapping[str, Training]) -> None:
                     raise ToolkitError(f"{name}: training failed: {_last_words(_output(training))}")
                 if code == 0:
                     done.add(name)
-                report(name, training.steps if code == 0 else _last_step(training.log), training.steps)
+                report(name, training.steps if code == 0 else _last_step(training.log), training.steps, {})
 
 
 def _start(training: Training, stack: ExitStack) -> subprocess.Popen[bytes]:

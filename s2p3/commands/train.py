@@ -33,7 +33,7 @@ from s2p3.commands.experiment import (
     experiment_of,
 )
 from s2p3.config import FrameSource, load
-from s2p3.console_output import say, show
+from s2p3.console_output import progress_bars, say, show
 
 if TYPE_CHECKING:
     from s2p3.config import ExperimentConfig
@@ -77,7 +77,9 @@ def train_detector(
     if mesh is not None and len(object) > 1:
         raise ToolkitError("--mesh is of one object; train a detector of several with built-in ones")
     models = [named_object(name, mesh) for name in object]
-    say(str(train(_some(sessions), models, chosen, out, workers=workers)))
+    with progress_bars() as report:
+        path = train(_some(sessions), models, chosen, out, workers=workers, report=report)
+    say(str(path))
 
 
 def train_teacher(
@@ -117,7 +119,9 @@ def train_teacher(
 
     _use(threads, frames.workers)
     model = named_object(object, mesh)
-    say(str(train(_some(sessions), model, chosen, out, cache=out.parent, frames=frames)))
+    with progress_bars() as report:
+        path = train(_some(sessions), model, chosen, out, cache=out.parent, frames=frames, report=report)
+    say(str(path))
 
 
 def train_student(
@@ -161,7 +165,10 @@ def train_student(
     if teacher is not None and not chosen.student.warm_start:
         raise ToolkitError("--teacher is what a warm start starts from; add --config.student.warm-start True")
     model = named_object(object, mesh)
-    say(str(train(_some(sessions), model, chosen, out, cache=out.parent, teacher=teacher, frames=frames)))
+    common = (_some(sessions), model, chosen, out)
+    with progress_bars() as report:
+        path = train(*common, teacher=teacher, cache=out.parent, frames=frames, report=report)
+    say(str(path))
 
 
 def train_supervised(
@@ -198,7 +205,10 @@ def train_supervised(
     _use(threads, frames.workers)
     chosen, model = experiment.within(experiment_of(preset, config)), named_object(object, mesh)
     train = train_on if network == "teacher" else train_student
-    say(str(train(_some(sessions), model, chosen, out, out.parent, frames=frames, stage="supervised")))
+    common = (_some(sessions), model, chosen, out)
+    with progress_bars() as report:
+        path = train(*common, cache=out.parent, frames=frames, stage="supervised", report=report)
+    say(str(path))
 
 
 def train_self_supervised(
@@ -246,7 +256,10 @@ def train_self_supervised(
     _use(threads, workers)
     model = named_object(object, mesh)
     settings = experiment.self_supervision if method == "s2p3" else experiment.self6d
-    say(str(adapt(session, split, model, detector, teacher, student, out, settings, workers)))
+    networks = (detector, teacher, student)
+    with progress_bars() as report:
+        path = adapt(session, split, model, *networks, out, settings, workers=workers, report=report)
+    say(str(path))
 
 
 def _some(sessions: list[Path]) -> list[Path]:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from s2p3.commands.arguments import ObjectName, OptionalPath, at_least
-from s2p3.console_output import say, show
+from s2p3.console_output import progress_bars, say, show
 
 Network = Annotated[Path, tyro.conf.arg(metavar="FILE")]
 """A checkpoint (.safetensors), or a model exported from one (.onnx)."""
@@ -58,7 +58,8 @@ def evaluate(
         check_out(out)
     names = told_apart([*beside, *([] if out is None else [out])])
     others = {name: Evaluation.load(path) for name, path in zip(names, beside, strict=False)}
-    result = evaluate_split(session, split, model, {"network": network}, detector)["network"]
+    with progress_bars() as report:
+        result = evaluate_split(session, split, model, {"network": network}, detector, report)["network"]
     against = {name: result.above(other) for name, other in others.items() if result.paired_with(other)}
     if out is not None:
         for path in write_files(out, names[-1], session, model, result, others, scene_id):

@@ -24,7 +24,7 @@ from s2p3.evaluation.summary import Difference, Summary, differences, grouped, o
 from s2p3.metrics import Floats
 from s2p3.networks.detector import Detection
 from s2p3.objects import ObjectModel, poses_of
-from s2p3.training.progress import OnStep, reporting
+from s2p3.progress import Report, quiet
 
 MINIMUM_VISIBLE = 0.1
 """Share of the silhouette from which a frame is a target, as in the BOP challenge."""
@@ -91,7 +91,7 @@ class Evaluation:
 
 
 def find_objects(
-    session: Session, indices: Sequence[int], detector: Path, object_name: str, on_step: OnStep | None = None
+    session: Session, indices: Sequence[int], detector: Path, object_name: str, report: Report = quiet
 ) -> list[Detection | None]:
     """The detector's answer for each frame; reads Stokes images only.
 
@@ -99,10 +99,9 @@ def find_objects(
     """
     find = Finder.load(detector, object_name)
     found = []
-    with reporting("detection", len(indices), on_step) as report:
-        for count, index in enumerate(indices, start=1):
-            found.append(find(session.stokes(index).stack()))
-            report(count, len(indices), {})
+    for count, index in enumerate(indices, start=1):
+        found.append(find(session.stokes(index).stack()))
+        report("detection", count, len(indices), {})
     return found
 
 
@@ -112,7 +111,7 @@ def evaluate(
     model: ObjectModel,
     network: Path,
     detections: Sequence[Detection | None],
-    on_step: OnStep | None = None,
+    report: Report = quiet,
 ) -> Evaluation:
     """Evaluates a teacher or student on frames of an annotated session.
 
@@ -129,20 +128,19 @@ def evaluate(
     camera = session.working_intrinsics
     ruler = Ruler(model, camera, _known_views(session, poses))
     records = []
-    with reporting("evaluation", len(targets), on_step) as report:
-        for count, position in enumerate(targets, start=1):
-            index = int(indices[position])
-            stokes, detection = session.stokes(index).stack(), detections[position]
-            depth = session.depth(index) if session.has_depth else None
-            found = None if detection is None else estimate(stokes, detection, camera, depth)
-            true = poses.T_cam_obj[index]
-            sight = ruler.sight(index, float(poses.visible_fraction[index]), true)
-            if found is None or not found.T_cam_obj.finite:
-                records.append(Record.missed(sight))
-            else:
-                box = found.detection.box_xywh
-                records.append(ruler.record(sight, found.T_cam_obj, true, box, found.score))
-            report(count, len(targets), {})
+    for count, position in enumerate(targets, start=1):
+        index = int(indices[position])
+        stokes, detection = session.stokes(index).stack(), detections[position]
+        depth = session.depth(index) if session.has_depth else None
+        found = None if detection is None else estimate(stokes, detection, camera, depth)
+        true = poses.T_cam_obj[index]
+        sight = ruler.sight(index, float(poses.visible_fraction[index]), true)
+        if found is None or not found.T_cam_obj.finite:
+            records.append(Record.missed(sight))
+        else:
+            box = found.detection.box_xywh
+            records.append(ruler.record(sight, found.T_cam_obj, true, box, found.score))
+        report(f"evaluation of {network.stem}", count, len(targets), {})
     return Evaluation.of(records, Subject.of(model, camera.width, session.session_id))
 
 

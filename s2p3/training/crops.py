@@ -27,9 +27,9 @@ from s2p3.config import InputConfig
 from s2p3.inputs import crop_intrinsics, extract_crop, extract_depth, square_box
 from s2p3.networks.detector import Detection
 from s2p3.objects import ObjectModel, Symmetry, poses_of
+from s2p3.progress import Report, quiet
 from s2p3.rendering import rasterize
 from s2p3.training.checkpoint import save_tensors
-from s2p3.training.progress import OnStep, reporting
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -133,7 +133,7 @@ def labelled_crops(
     model: ObjectModel,
     config: InputConfig,
     cache: Path | None = None,
-    on_step: OnStep | None = None,
+    report: Report = quiet,
 ) -> LabelledCrops:
     """The crops of every frame of `paths` that shows the object, with dense targets drawn by the rasterizer.
 
@@ -148,24 +148,23 @@ def labelled_crops(
         return LabelledCrops(**load_file(stored))
     shown = shown_rows(paths, model)
     rows: list[dict[str, NDArray[np.generic]]] = []
-    with reporting(f"crops of {model.name}", len(shown), on_step) as report:
-        for number, path in enumerate(paths):
-            with Session.open(path) as session:
-                poses = poses_of(session, model)
-                for index in (index for which, index in shown if which == number):
-                    stokes = np.moveaxis(session.stokes(index).stack(), 0, -1)
-                    mask, pose = poses.mask(index), poses.T_cam_obj[index]
-                    crop = labelled_crop(
-                        stokes,
-                        mask,
-                        pose,
-                        session.working_intrinsics,
-                        model,
-                        config,
-                        depth_of(session, index, config),
-                    )
-                    rows.append(crop)
-                    report(len(rows), len(shown), {})
+    for number, path in enumerate(paths):
+        with Session.open(path) as session:
+            poses = poses_of(session, model)
+            for index in (index for which, index in shown if which == number):
+                stokes = np.moveaxis(session.stokes(index).stack(), 0, -1)
+                mask, pose = poses.mask(index), poses.T_cam_obj[index]
+                crop = labelled_crop(
+                    stokes,
+                    mask,
+                    pose,
+                    session.working_intrinsics,
+                    model,
+                    config,
+                    depth_of(session, index, config),
+                )
+                rows.append(crop)
+                report(f"crops of {model.name}", len(rows), len(shown), {})
     crops = collate(rows)
     if stored is not None:
         stored.parent.mkdir(parents=True, exist_ok=True)

@@ -18,12 +18,12 @@ from s2p3.inputs import rotate_stokes
 from s2p3.networks.detector import CELL, Detector, detector_input, downsample
 from s2p3.networks.lite0 import channels_last
 from s2p3.objects import ObjectModel
+from s2p3.progress import Report, quiet
 from s2p3.training import checkpoint
-from s2p3.training.checkpoint import CheckpointInfo, Validation
+from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import content_hashes, once
 from s2p3.training.examples import MOST_HELD_OUT
-from s2p3.training.loop import Forward, Losses, Score, optimize
-from s2p3.training.progress import OnStep, reporting
+from s2p3.training.loop import Forward, Losses, Run, Score, optimize
 
 # Ranges of the augmentation, our choice: wide, because the captured domain is not known.
 _SCALE = (0.75, 1.35)
@@ -58,28 +58,28 @@ class SmallFrames:
 
 
 def small_frames(
-    paths: Sequence[Path], names: Sequence[str], level: int, on_step: OnStep | None = None
+    paths: Sequence[Path], names: Sequence[str], level: int, report: Report = quiet
 ) -> SmallFrames:
     """Every frame of `paths`, down-sampled by `level`, with a class for the visible mask of each object.
 
     Raises ToolkitError: no frames; a session that shows none of the objects, an object that is in none.
     """
     stokes, masks, found = [], [], set[str]()
-    with reporting(f"frames with {', '.join(names)}", 1, on_step) as report:
-        for path in paths:
-            with Session.open(path) as session:
-                here = [name for name in names if session.contents.has(f"poses/objects/{name}")]
-                # a session without any of them says itself what it lacks
-                poses = {name: session.object_poses(name) for name in here or names[:1]}
-                found |= set(here)
-                for index in range(len(session)):
-                    image = torch.from_numpy(session.stokes(index).stack())
-                    mask = torch.zeros(len(names), *image.shape[1:])
-                    for name, one in poses.items():
-                        mask[names.index(name)] = torch.from_numpy(one.mask(index))
-                    stokes.append(downsample(image[None], level)[0].half())
-                    masks.append(downsample(mask[None], level)[0].half())
-                    report(index + 1, len(session), {})
+    label = f"frames with {', '.join(names)}"
+    for path in paths:
+        with Session.open(path) as session:
+            here = [name for name in names if session.contents.has(f"poses/objects/{name}")]
+            # a session without any of them says itself what it lacks
+            poses = {name: session.object_poses(name) for name in here or names[:1]}
+            found |= set(here)
+            for index in range(len(session)):
+                image = torch.from_numpy(session.stokes(index).stack())
+                mask = torch.zeros(len(names), *image.shape[1:])
+                for name, one in poses.items():
+                    mask[names.index(name)] = torch.from_numpy(one.mask(index))
+                stokes.append(downsample(image[None], level)[0].half())
+                masks.append(downsample(mask[None], level)[0].half())
+                report(label, index + 1, len(session), {})
     if missing := [name for name in names if name not in found]:
         raise ToolkitError(f"no session shows {', '.join(missing)}; synthesize some that do, or leave it out")
     if not stokes:
@@ -92,15 +92,16 @@ def train_detector(
     models: ObjectModel | Sequence[ObjectModel],
     config: ExperimentConfig,
     out: Path,
-    on_step: OnStep | None = None,
+    *,
     workers: int = 0,
+    report: Report = quiet,
 ) -> Path:
     """Trains a detector of one object or several and writes `out`/detector.safetensors, which is returned.
 
     Args:
         sessions: with poses and masks of the objects, usually synthetic; each shows one of them at least.
         models: a class each, in this order.
-        on_step, workers: see `loop.optimize`.
+        workers, report: see `loop.Run`.
 
     Raises ToolkitError: a session shows none of the objects; see also `loop.optimize`.
     """
@@ -108,30 +109,20 @@ def train_detector(
     names, settings = [model.name for model in models], config.detector
     path = checkpoint.to_write(out / "detector.safetensors")
     hashes = _hashes(sessions, models)
-    frames = small_frames(sessions, names, settings.level)
+    frames = small_frames(sessions, names, settings.level, report)
     order = torch.randperm(len(frames), generator=torch.Generator().manual_seed(settings.seed))
     count = min(int(settings.holdout * len(frames)), MOST_HELD_OUT) if settings.validations else 0
     data, score = FrameData(frames, order[count:].sort().values), None
     if count:
-        score = Score("mask_iou", MaskScorer(frames.take(order[:count])), settings.validations)
+        scorer = MaskScorer(frames.take(order[:count]))
+        score = Score("mask_iou", scorer, settings.validations, f"{count} of {len(frames)} frames")
     torch.manual_seed(settings.seed)
     network = channels_last(Detector(frames.masks.shape[1], config.network.imagenet))
-    trained = optimize(
-        network,
-        data,
-        detector_objective,
-        settings,
-        path,
-        f"{hashes} {names}",
-        "detector",
-        score=score,
-        workers=workers,
-        on_step=on_step,
+    run = Run("detector", path, f"{hashes} {names}", workers, report)
+    trained = optimize(network, data, detector_objective, settings, run, score)
+    info = CheckpointInfo.of(
+        "detector", "pretrained", models[0], trained.step, config, hashes, trained.validation
     )
-    validation = None
-    if score is not None and trained.score is not None:
-        validation = Validation(score.name, trained.score, f"{count} of {len(frames)} frames")
-    info = CheckpointInfo.of("detector", "pretrained", models[0], trained.step, config, hashes, validation)
     checkpoint.save(path, trained.network.state_dict(), replace(info, classes=tuple(names)))
     return path
 

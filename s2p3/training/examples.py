@@ -14,6 +14,7 @@ from dataset.errors import ToolkitError
 from dataset.session import Session
 from s2p3.config import FrameSource, InputConfig, SupervisedConfig
 from s2p3.objects import ObjectModel
+from s2p3.progress import Report, quiet
 from s2p3.training.crops import LabelledCrops, content_hashes, labelled_crops, shown_rows
 from s2p3.training.loader import CropDataset
 
@@ -57,11 +58,12 @@ class Examples:
         settings: SupervisedConfig,
         frames: FrameSource,
         cache: Path | None = None,
+        report: Report = quiet,
     ) -> Examples:
         """The crops of sessions, as `frames` says.
 
         Args:
-            cache: see `labelled_crops`.
+            cache, report: see `labelled_crops`.
 
         Raises ToolkitError: a session lacks the object or the split, or is given twice; no frame shows it.
         """
@@ -70,12 +72,12 @@ class Examples:
         hashes = content_hashes([*sessions, *scored_on], model)
         source: CropSource
         if frames.storage == "memory":
-            source = labelled_crops(sessions, model, config, cache)
+            source = labelled_crops(sessions, model, config, cache, report)
         else:
             source = CropDataset(sessions, model, config)
         held_out = None
         if scored_on:
-            held_out = labelled_crops(scored_on, model, config, cache)
+            held_out = labelled_crops(scored_on, model, config, cache, report)
         elif len(division.held_out):
             held_out = source.take(division.held_out)
         return Examples(source, division.rows, held_out, division.origin, hashes)

@@ -22,11 +22,11 @@ from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
 from s2p3.config import Schedule, StageConfig
-from s2p3.training.checkpoint import RESUME, save_tensors
+from s2p3.progress import Report, quiet
+from s2p3.training.checkpoint import RESUME, Validation, save_tensors
 from s2p3.training.loader import Data, Steps, stream
 from s2p3.training.log import RunLog
 from s2p3.training.processes import Processes
-from s2p3.training.progress import OnStep, reporting
 from s2p3.training.resume import State
 from s2p3.training.trees import named_tensors, to_device
 
@@ -60,11 +60,13 @@ class Score:
         name: of the number, which is the higher the better.
         of: the number of a network in evaluation mode.
         times: how often it is taken, at equal distances, the last time at the end.
+        frames: that it is taken on, in words.
     """
 
     name: str
     of: Callable[[Any], float]
     times: int
+    frames: str
 
     def is_due(self, done: int, steps: int) -> bool:
         """Whether it is taken after `done` of `steps` steps."""
@@ -78,12 +80,33 @@ class Trained(Generic[Network]):
     Attributes:
         network: with the weights to keep, on the CPU, in evaluation mode.
         step: after which it had them.
-        score: theirs; None where nothing was scored.
+        validation: how they were chosen; None where they are the last.
     """
 
     network: Network
     step: int
-    score: float | None = None
+    validation: Validation | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """A training: what it is called, where it writes, how it is fed and shown.
+
+    Attributes:
+        label: what progress and messages call it.
+        path: of the checkpoint to be. The log NAME.log.jsonl, the folder tensorboard/NAME and, until
+            `checkpoint.save` has written it, the resume file NAME.resume.safetensors stand beside it.
+        fingerprint: of everything it depends on besides its settings; a resume file of another one is
+            refused.
+        workers: processes that make the batches; with 0 this one does.
+        report: told of every step, with the latest losses.
+    """
+
+    label: str
+    path: Path
+    fingerprint: str
+    workers: int = 0
+    report: Report = quiet
 
 
 def optimize(
@@ -91,32 +114,19 @@ def optimize(
     data: Data,
     objective: Objective,
     settings: StageConfig,
-    path: Path,
-    fingerprint: str,
-    label: str,
-    *,
+    run: Run,
     score: Score | None = None,
-    workers: int = 0,
-    on_step: OnStep | None = None,
 ) -> Trained[Network]:
     """Trains `network` in place; returns its averaged weights: the best or, where none are scored, the last.
 
     Args:
         data: what the batches are drawn from.
-        path: of the checkpoint to be. The log NAME.log.jsonl, the folder tensorboard/NAME and, until
-            `checkpoint.save` has written it, the resume file NAME.resume.safetensors stand beside it.
-        fingerprint: of everything the run depends on besides `settings`; a resume file of another run is
-            refused.
-        label: what the progress bar and messages call this run.
-        workers: processes that make the batches; with 0 this one does.
-        on_step: called after every step with step, steps and the latest losses; without it a progress bar is
-            shown.
 
     Raises ToolkitError: the resume file belongs to other settings; a loss or gradient is not finite.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    run.path.parent.mkdir(parents=True, exist_ok=True)
     steps = settings.steps_over(len(data))
-    run = hashlib.sha256(f"{settings} {steps} {fingerprint}".encode()).hexdigest()[:16]
+    whole = hashlib.sha256(f"{settings} {steps} {run.fingerprint}".encode()).hexdigest()[:16]
     processes = Processes.start()
     objective = to_device(objective, processes.device)
     network.to(processes.device)
@@ -124,12 +134,12 @@ def optimize(
     optimizer = torch.optim.AdamW(
         network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
     )
-    state = State(path.with_suffix(RESUME), run, network, average, optimizer)
+    state = State(run.path.with_suffix(RESUME), whole, network, average, optimizer)
     first = processes.common_step(state.restore())
     forward = processes.prepare(network)
-    batches = stream(Steps(data, settings.batch, settings.seed, processes.share), first, steps, workers)
+    batches = stream(Steps(data, settings.batch, settings.seed, processes.share), first, steps, run.workers)
     started = time.perf_counter()
-    with RunLog(path, first) as log, reporting(label, steps, on_step) as report, closing(batches):
+    with RunLog(run.path, first) as log, closing(batches):
         for done, batch in enumerate(batches, start=first + 1):
             rate = settings.learning_rate * rate_factor(settings.schedule, (done - 1) / steps)
             for group in optimizer.param_groups:
@@ -142,8 +152,8 @@ def optimize(
             norm = float(nn.utils.clip_grad_norm_(network.parameters(), settings.clip_norm))
             values = {name: float(loss.detach()) for name, loss in losses.items()}
             if not math.isfinite(values["total"] + norm):
-                kept = path.with_suffix(f".bad-batch{processes.suffix}.safetensors")
-                raise _not_finite(label, done, values, norm, kept, network, batch)
+                kept = run.path.with_suffix(f".bad-batch{processes.suffix}.safetensors")
+                raise _not_finite(run.label, done, values, norm, kept, network, batch)
             optimizer.step()
             update_average(average, network, min(settings.ema, done / (done + 9)))
             if not processes.first:
@@ -152,7 +162,7 @@ def optimize(
             if score is not None and scored:
                 values[score.name] = score.of(average)
                 state.consider(done, values[score.name])
-            report(done, steps, values)
+            run.report(run.label, done, steps, values)
             if scored or done % _LOG_EVERY == 0 or done == steps:
                 seconds = round(time.perf_counter() - started, 2)
                 log.write({"step": done, "seconds": seconds, "learning_rate": rate, **values})
@@ -163,7 +173,9 @@ def optimize(
         average.load_state_dict(best.weights)
     processes.broadcast(average)
     average = average.cpu().eval()
-    return Trained(average, steps) if best is None else Trained(average, best.step, best.score)
+    if best is None or score is None:
+        return Trained(average, steps)
+    return Trained(average, best.step, Validation(score.name, best.score, score.frames))
 
 
 def rate_factor(schedule: Schedule, progress: float) -> float:

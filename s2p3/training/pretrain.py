@@ -25,13 +25,13 @@ from s2p3.networks.pose_head import decode_pose, ray_rotation, site_from_transla
 from s2p3.networks.student import Student
 from s2p3.networks.teacher import Teacher, TeacherOutput, pose_of
 from s2p3.objects import ObjectModel
+from s2p3.progress import Report, quiet
 from s2p3.training import checkpoint
 from s2p3.training.batches import Targets, as_predicted, form_input, form_targets
-from s2p3.training.checkpoint import CheckpointInfo, Kind, Validation
+from s2p3.training.checkpoint import CheckpointInfo, Kind
 from s2p3.training.examples import CropSource, Examples
-from s2p3.training.loop import Forward, Losses, Objective, Score, optimize
+from s2p3.training.loop import Forward, Losses, Objective, Run, Score, optimize
 from s2p3.training.physics_signal import labelled_signal, report_signal
-from s2p3.training.progress import OnStep
 from s2p3.training.scoring import PoseScorer
 
 Stage = Literal["pretrained", "supervised"]
@@ -45,29 +45,30 @@ def train_teacher(
     model: ObjectModel,
     config: ExperimentConfig,
     out: Path,
+    *,
     cache: Path | None = None,
-    on_step: OnStep | None = None,
     frames: FrameSource = ALL_FRAMES,
     stage: Stage = "pretrained",
+    report: Report = quiet,
 ) -> Path:
     """Pre-trains the teacher and writes `out`/teacher.safetensors, which is returned.
 
     Args:
         sessions: with poses of the object, usually synthetic.
         cache: folder for the crops, shared between trainings.
-        on_step: see `loop.optimize`.
         frames: which of the sessions to train on, and how they reach the training.
         stage: what the checkpoint calls this training.
+        report: see `loop.Run`.
 
     Raises ToolkitError: a session lacks the object; see also `loop.optimize`.
     """
     path, settings = checkpoint.to_write(out / "teacher.safetensors"), config.teacher
-    examples = Examples.of(sessions, model, config.input, settings, frames, cache)
+    examples = Examples.of(sessions, model, config.input, settings, frames, cache, report)
     torch.manual_seed(settings.seed)
     network = build_teacher(config, imagenet=True)
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
     run = Pretraining("teacher", model, config, settings, examples, stage)
-    return run.train(network, objective, path, frames.workers, on_step)
+    return run.train(network, objective, path, frames.workers, report)
 
 
 def train_student(
@@ -75,11 +76,12 @@ def train_student(
     model: ObjectModel,
     config: ExperimentConfig,
     out: Path,
-    cache: Path | None = None,
+    *,
     teacher: Path | None = None,
-    on_step: OnStep | None = None,
+    cache: Path | None = None,
     frames: FrameSource = ALL_FRAMES,
     stage: Stage = "pretrained",
+    report: Report = quiet,
 ) -> Path:
     """Pre-trains the student and writes `out`/student.safetensors, which is returned.
 
@@ -92,7 +94,7 @@ def train_student(
         `train_teacher`.
     """
     path, settings = checkpoint.to_write(out / "student.safetensors"), config.student
-    examples = Examples.of(sessions, model, config.input, settings, frames, cache)
+    examples = Examples.of(sessions, model, config.input, settings, frames, cache, report)
     torch.manual_seed(settings.seed)
     network = build_student(config, imagenet=True)
     if settings.warm_start:
@@ -109,7 +111,7 @@ def train_student(
         network.encoder.load_state_dict(guide.encoder.state_dict())
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
     run = Pretraining("student", model, config, settings, examples, stage)
-    return run.train(network, objective, path, frames.workers, on_step)
+    return run.train(network, objective, path, frames.workers, report)
 
 
 def _encoders(config: ExperimentConfig) -> tuple[str, str, int]:
@@ -134,7 +136,7 @@ class Pretraining:
         objective: Objective,
         path: Path,
         workers: int,
-        on_step: OnStep | None,
+        report: Report,
     ) -> Path:
         """Optimizes `network` and writes the checkpoint `path`, which is returned."""
         examples, index = self.examples, self.model.refractive_index
@@ -145,26 +147,13 @@ class Pretraining:
         score = None
         if examples.held_out is not None:
             scorer = PoseScorer(examples.held_out, self.model, self.config)
-            score = Score(scorer.name, scorer, self.settings.validations)
+            score = Score(scorer.name, scorer, self.settings.validations, examples.origin)
         rows = examples.rows.tolist()
         fingerprint = f"{examples.hashes} {self.config} {self.model.fingerprint} {rows} {examples.origin}"
-        trained = optimize(
-            network,
-            data,
-            objective,
-            self.settings,
-            path,
-            fingerprint,
-            self.kind,
-            score=score,
-            workers=workers,
-            on_step=on_step,
-        )
-        validation = None
-        if score is not None and trained.score is not None:
-            validation = Validation(score.name, trained.score, examples.origin)
+        run = Run(self.kind, path, fingerprint, workers, report)
+        trained = optimize(network, data, objective, self.settings, run, score)
         info = CheckpointInfo.of(
-            self.kind, self.stage, self.model, trained.step, self.config, examples.hashes, validation
+            self.kind, self.stage, self.model, trained.step, self.config, examples.hashes, trained.validation
         )
         checkpoint.save(path, trained.network.state_dict(), info)
         return path

@@ -26,14 +26,14 @@ from s2p3.networks.perceptual import Perceptual
 from s2p3.networks.pose_head import decode_pose
 from s2p3.networks.teacher import pose_of
 from s2p3.objects import ObjectModel
+from s2p3.progress import Report, quiet
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
 from s2p3.training.batch_norm import freeze_norms
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
-from s2p3.training.loop import Forward, Losses, optimize
+from s2p3.training.loop import Forward, Losses, Run, optimize
 from s2p3.training.pretrain import model_tensors
-from s2p3.training.progress import OnStep
 from s2p3.training.pseudo_labels import make_labels, pooled_maps
 from s2p3.training.self_supervised import (
     CapturedBatch,
@@ -52,8 +52,9 @@ def self_supervise_rgbd(
     student: Path,
     out: Path,
     settings: Self6DConfig | None = None,
-    on_step: OnStep | None = None,
+    *,
     workers: int = 0,
+    report: Report = quiet,
 ) -> Path:
     """Adapts a pre-trained student without polarization to captured frames with depth; arguments and result
     as `self_supervise`.
@@ -77,17 +78,9 @@ def self_supervise_rgbd(
     freeze_norms(pair.student)
     data = CapturedData(crops, labels, mesh, model.refractive_index, pair.config)
     objective = _Objective(mesh, *model_tensors(model), model.diameter, perceptual, settings)
-    trained = optimize(
-        pair.student,
-        data,
-        objective,
-        settings,
-        path,
-        f"{hashes} {model.fingerprint} {pair.config}",
-        "self-supervision (RGB-D)",
-        workers=workers,
-        on_step=on_step,
-    )
+    fingerprint = f"{hashes} {model.fingerprint} {pair.config}"
+    run = Run("self-supervision (RGB-D)", path, fingerprint, workers, report)
+    trained = optimize(pair.student, data, objective, settings, run)
     config = replace(pair.config, self6d=settings)
     info = CheckpointInfo.of("student", "self-supervised", model, trained.step, config, hashes)
     checkpoint.save(path, trained.network.state_dict(), info)

@@ -22,17 +22,17 @@ from s2p3.networks.pose_head import decode_pose
 from s2p3.networks.student import Student
 from s2p3.networks.teacher import MAP_STRIDE, Teacher, TeacherOutput, pose_of
 from s2p3.objects import ObjectModel
+from s2p3.progress import Report, quiet
 from s2p3.rendering.differentiable import RenderMesh, RenderOutput, render
 from s2p3.training import checkpoint
 from s2p3.training.batch_norm import adapt_batch_norm, freeze_norms, set_momentum
 from s2p3.training.batches import form_input
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
-from s2p3.training.loop import Forward, Losses, optimize
+from s2p3.training.loop import Forward, Losses, Run, optimize
 from s2p3.training.mean_teacher import MeanTeacher
 from s2p3.training.physics_signal import captured_signal, report_signal
 from s2p3.training.pretrain import load_student, load_teacher, model_tensors
-from s2p3.training.progress import OnStep
 from s2p3.training.pseudo_labels import PseudoLabels, labels_of, make_labels, pooled_maps, warp_labels
 
 _BATCH_NORM_MOMENTUM = 0.02
@@ -45,8 +45,9 @@ def self_supervise(
     student: Path,
     out: Path,
     settings: SelfSupervisionConfig | None = None,
-    on_step: OnStep | None = None,
+    *,
     workers: int = 0,
+    report: Report = quiet,
 ) -> Path:
     """Adapts the pre-trained student to captured frames and writes `out`/adapted.safetensors, which is
     returned. NAME.signal.json beside it says what the frames' polarization tells, at the teacher's poses.
@@ -55,7 +56,7 @@ def self_supervise(
         crops: of captured frames, see `crops.captured_crops`.
         teacher, student: checkpoints of the pre-trained networks.
         settings: weights and schedule; by default those the student's experiment holds.
-        on_step, workers: see `loop.optimize`.
+        workers, report: see `loop.Run`.
 
     Raises ToolkitError: checkpoints of another object or of different inputs; a depth loss without depth; a
         teacher that is to follow a student of another architecture; see also `loop.optimize`.
@@ -91,17 +92,9 @@ def self_supervise(
         settings,
     )
     hashes = pair.hashes | {"crops": crops_hash(crops)}
-    trained = optimize(
-        network,
-        data,
-        objective,
-        settings,
-        path,
-        f"{hashes} {model.fingerprint} {pair.config}",
-        "self-supervision",
-        workers=workers,
-        on_step=on_step,
-    )
+    fingerprint = f"{hashes} {model.fingerprint} {pair.config}"
+    run = Run("self-supervision", path, fingerprint, workers, report)
+    trained = optimize(network, data, objective, settings, run)
     kept = trained.network.student if isinstance(trained.network, MeanTeacher) else trained.network
     config = replace(pair.config, self_supervision=settings)
     info = CheckpointInfo.of("student", "self-supervised", model, trained.step, config, hashes)

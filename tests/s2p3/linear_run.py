@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from s2p3.config import StageConfig
-from s2p3.training.loop import Forward, Losses, Score, optimize
+from s2p3.training.loop import Forward, Losses, Run, Score, optimize
 from s2p3.training.processes import Processes
 
 ROWS = 12
@@ -64,9 +64,9 @@ def run(folder: Path) -> None:
     torch.set_num_threads(1)
     folder.mkdir(exist_ok=True)
     objective = Squares([])
-    score = Score("closeness", closeness, 3)
+    score = Score("closeness", closeness, 3, "all numbers")
     path = folder / "linear.safetensors"
-    trained = optimize(network(), Numbers(), objective, SETTINGS, path, "", "linear", score=score)
+    trained = optimize(network(), Numbers(), objective, SETTINGS, Run("linear", path, ""), score)
     rank = Processes.start().share.rank
     (folder / f"seen-{rank}.json").write_text(json.dumps(objective.seen))
     weights = {name: value.contiguous() for name, value in trained.network.state_dict().items()}

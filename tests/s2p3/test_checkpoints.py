@@ -22,10 +22,6 @@ from s2p3.training.pretrain import load_student, load_teacher
 from tests.s2p3.untrained import save_untrained
 
 
-def silent(step: int, steps: int, values: dict[str, float]) -> None:
-    del step, steps, values
-
-
 def larger(model: ObjectModel, factor: float) -> ObjectModel:
     return dataclasses.replace(model, vertices=model.vertices * factor, diameter=model.diameter * factor)
 
@@ -88,7 +84,7 @@ def test_a_network_of_a_larger_cup_is_refused(networks: dict[str, Path], cup: Ob
 
 def test_a_session_of_a_larger_cup_is_refused(cup_session: Path, cup: ObjectModel) -> None:
     with pytest.raises(ToolkitError, match="'cup' has another mesh than the one given"):
-        labelled_crops([cup_session], larger(cup, 1.3), presets.quick().input, on_step=silent)
+        labelled_crops([cup_session], larger(cup, 1.3), presets.quick().input)
 
 
 def test_kept_crops_are_those_of_the_object_as_it_is_now(
@@ -96,9 +92,9 @@ def test_kept_crops_are_those_of_the_object_as_it_is_now(
 ) -> None:
     config, axis = presets.quick().input, torch.tensor([0.0, 0.0, 1.0]).double().numpy()
     turning = dataclasses.replace(cup, symmetry=Symmetry(axis=axis))
-    before = labelled_crops([cup_session], cup, config, tmp_path, silent)
-    after = labelled_crops([cup_session], turning, config, tmp_path, silent)
-    anew = labelled_crops([cup_session], turning, config, on_step=silent)
+    before = labelled_crops([cup_session], cup, config, tmp_path)
+    after = labelled_crops([cup_session], turning, config, tmp_path)
+    anew = labelled_crops([cup_session], turning, config)
     assert torch.equal(after.rotation, anew.rotation)
     assert not torch.equal(after.rotation, before.rotation)
 
@@ -118,13 +114,13 @@ def test_a_session_counts_once(cup_session: Path, cup: ObjectModel, tmp_path: Pa
     twice, config = [cup_session, cup_session], presets.quick()
     for train in (train_student, train_detector):
         with pytest.raises(ToolkitError, match="this session was given before; name each one once"):
-            train(twice, cup, config, tmp_path, on_step=silent)
+            train(twice, cup, config, tmp_path)
 
 
 def test_a_session_does_not_validate_itself(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
     frames = presets.FrameSource(validation=str(cup_session))
     with pytest.raises(ToolkitError, match="this session was given before"):
-        train_student([cup_session], cup, presets.quick(), tmp_path, on_step=silent, frames=frames)
+        train_student([cup_session], cup, presets.quick(), tmp_path, frames=frames)
 
 
 def test_a_finished_checkpoint_is_not_overwritten(
@@ -132,7 +128,7 @@ def test_a_finished_checkpoint_is_not_overwritten(
 ) -> None:
     before = networks["student"].read_bytes()
     with pytest.raises(ToolkitError, match=r"student.safetensors is there already; delete it to train anew"):
-        train_student([cup_session], cup, presets.quick(), networks["student"].parent, on_step=silent)
+        train_student([cup_session], cup, presets.quick(), networks["student"].parent)
     assert networks["student"].read_bytes() == before
 
 
@@ -141,4 +137,4 @@ def test_a_damaged_resume_file_is_refused(cup_session: Path, cup: ObjectModel, t
     with pytest.raises(
         ToolkitError, match=r"student.resume.safetensors: damaged .*; delete it to start anew"
     ):
-        train_student([cup_session], cup, presets.quick(), tmp_path, on_step=silent)
+        train_student([cup_session], cup, presets.quick(), tmp_path)

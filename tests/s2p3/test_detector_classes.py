@@ -38,18 +38,18 @@ def detector(
     few = dataclasses.replace(base.detector, steps=3, batch=4, threshold=0.01, minimum_score=0.0)
     config = dataclasses.replace(base, detector=few)
     out = tmp_path_factory.mktemp("detector")
-    return train_detector([cup_session, fork_session], [cup, build("fork")], config, out, lambda *_: None)
+    return train_detector([cup_session, fork_session], [cup, build("fork")], config, out)
 
 
 def test_every_session_shows_its_own_object(cup_session: Path, fork_session: Path) -> None:
-    frames = small_frames([cup_session, fork_session], ["cup", "fork"], 4, lambda *_: None)
+    frames = small_frames([cup_session, fork_session], ["cup", "fork"], 4)
     shown = frames.masks.float().sum((2, 3)) > 0
     assert shown[:8].tolist() == [[True, False]] * 8
     assert shown[8:].tolist() == [[False, True]] * 8
     with pytest.raises(ToolkitError, match="no session shows knife"):
-        small_frames([cup_session], ["cup", "knife"], 4, lambda *_: None)
+        small_frames([cup_session], ["cup", "knife"], 4)
     with pytest.raises(ToolkitError, match="'fork' has no poses"):
-        small_frames([cup_session], ["fork"], 4, lambda *_: None)
+        small_frames([cup_session], ["fork"], 4)
 
 
 def test_a_detector_is_asked_for_its_objects_by_name(detector: Path, cup_session: Path) -> None:

@@ -42,17 +42,13 @@ def found_in(session: Session, cup: ObjectModel) -> list[Detection | None]:
     return [Detection(mask_box(mask), mask, 0.9) for mask in masks]
 
 
-def silent(step: int, steps: int, values: dict[str, float]) -> None:
-    del step, steps, values
-
-
 def test_every_target_is_counted(
     cup_session: Path, cup: ObjectModel, networks: tuple[Path, Path], tmp_path: Path
 ) -> None:
     with Session.open(cup_session) as session:
         found = found_in(session, cup)
         found[2] = found[5] = None
-        result = evaluate(session, range(8), cup, networks[0], found, silent)
+        result = evaluate(session, range(8), cup, networks[0], found)
     assert (result.summary.targets, result.summary.missed, result.summary.metric) == (8, 2, "ADD")
     assert np.isinf(result.errors_m).tolist() == [i in (2, 5) for i in range(8)]
     result.save(tmp_path / "evaluation.json")
@@ -80,14 +76,14 @@ def test_the_truth_does_not_reach_the_networks(
         )
         np.testing.assert_array_equal(a, b)
         assert (find(session.stokes(0).stack()) is None) == (find(seeing.stokes(0).stack()) is None)
-        assert len(find_objects(session, range(8), networks[1], "cup", silent)) == 8
+        assert len(find_objects(session, range(8), networks[1], "cup")) == 8
 
 
 def test_an_empty_split_is_said_clearly(
     cup_session: Path, cup: ObjectModel, networks: tuple[Path, Path]
 ) -> None:
     with Session.open(cup_session) as session, pytest.raises(ToolkitError, match="choose another split"):
-        evaluate(session, [], cup, networks[0], [], silent)
+        evaluate(session, [], cup, networks[0], [])
 
 
 def exact(session: Session, cup: ObjectModel, error: float) -> Evaluation:

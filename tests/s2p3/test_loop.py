@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -24,7 +23,8 @@ from s2p3.config import AugmentationConfig
 from s2p3.networks.teacher import TeacherOutput
 from s2p3.objects import ObjectModel
 from s2p3.training import train_student
-from s2p3.training.loop import Forward, Losses, Score, Trained, optimize, rate_factor
+from s2p3.training.checkpoint import Validation
+from s2p3.training.loop import Forward, Losses, Run, Score, Trained, optimize, rate_factor
 from s2p3.training.pretrain import load_student
 from s2p3.training.processes import Processes
 from tests.s2p3.linear_run import SETTINGS, Numbers, Squares, network, run
@@ -33,22 +33,14 @@ ROOT = Path(__file__).parents[2]
 
 
 def train(folder: Path, objective: Squares | Broken, score: Score | None = None) -> Trained[nn.Module]:
-    path = folder / "linear.safetensors"
     return optimize(
-        network(), Numbers(), objective, SETTINGS, path, "", "linear", score=score, on_step=lambda *_: None
+        network(), Numbers(), objective, SETTINGS, Run("linear", folder / "linear.safetensors", ""), score
     )
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def launch(*words: object) -> None:
     """Runs a Python script or module by two processes that train together."""
-    together = ["-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(free_port())]
+    together = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command = [sys.executable, *together, *map(str, words)]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE)
@@ -93,7 +85,7 @@ def test_two_processes_train_a_student_together(cup_session: Path, cup: ObjectMo
     words = ["train", "student", cup_session, "--object", "cup", "--config", tmp_path / "experiment.toml"]
     together, alone = tmp_path / "together", tmp_path / "alone"
     launch("-m", "s2p3", *words, "--workers", 0, "--out", together)
-    train_student([cup_session], cup, config, alone, cache=tmp_path, on_step=lambda *_: None)
+    train_student([cup_session], cup, config, alone, cache=tmp_path)
     files = [{path.name for path in folder.iterdir()} for folder in (together, alone)]
     assert files[0] == files[1] >= {"student.safetensors", "student.json", "student.log.jsonl"}
     (line,), (expected,) = (
@@ -113,15 +105,19 @@ def test_the_weights_that_score_best_are_kept(tmp_path: Path, best: int) -> None
         taken.append(network.weight.detach().clone())
         return 1.0 if len(taken) == best else 0.5
 
-    trained = train(tmp_path, Squares([]), Score("made_up", of, 3))
-    assert (trained.step, trained.score, len(taken)) == (10 * best, 1.0, 3)
+    trained = train(tmp_path, Squares([]), Score("made_up", of, 3, "none"))
+    assert (trained.step, trained.validation, len(taken)) == (
+        10 * best,
+        Validation("made_up", 1.0, "none"),
+        3,
+    )
     assert torch.equal(trained.network.weight, taken[best - 1])
 
 
 def test_what_is_written_down(tmp_path: Path) -> None:
     """The same numbers for scripts and for TensorBoard."""
-    trained = train(tmp_path, Squares([]), Score("made_up", lambda _: 7.0, 6))
-    assert trained.score == 7
+    trained = train(tmp_path, Squares([]), Score("made_up", lambda _: 7.0, 6, "none"))
+    assert trained.validation == Validation("made_up", 7, "none")
     lines = [json.loads(line) for line in (tmp_path / "linear.log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [5, 10, 15, 20, 25, 30]
     events = EventAccumulator(str(tmp_path / "tensorboard" / "linear"))

@@ -97,8 +97,8 @@ def test_an_evaluation_compares_with_the_truth_and_shows_it_to_nobody(
     records = []
     for path in (session, lying):
         with Session.open(path) as opened:
-            found = find_objects(opened, SHOTS, detector, cup.name, lambda *_: None)
-            records.append(evaluate(opened, SHOTS, cup, network, found, lambda *_: None).records)
+            found = find_objects(opened, SHOTS, detector, cup.name)
+            records.append(evaluate(opened, SHOTS, cup, network, found).records)
     true, false = records
     assert [one.T_cam_obj for one in true] == [one.T_cam_obj for one in false]
     assert [one.error_m("ADD") for one in true] != [one.error_m("ADD") for one in false]

@@ -27,7 +27,7 @@ def experiment() -> ExperimentConfig:
 
 @pytest.fixture(scope="module")
 def crops(cup_session: Path, cup: ObjectModel, experiment: ExperimentConfig) -> LabelledCrops:
-    return labelled_crops([cup_session], cup, experiment.input, on_step=lambda *_: None)
+    return labelled_crops([cup_session], cup, experiment.input)
 
 
 def true_labels(crops: LabelledCrops, mesh: RenderMesh, experiment: ExperimentConfig) -> PseudoLabels:

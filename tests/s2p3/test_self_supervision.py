@@ -7,6 +7,7 @@ import dataclasses
 import json
 import shutil
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -58,10 +59,6 @@ def tiny(
     )
 
 
-def silent(step: int, steps: int, values: dict[str, float]) -> None:
-    del step, steps, values
-
-
 @pytest.fixture(scope="module")
 def with_depth(cup_session: Path, cup: ObjectModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The session of the cup with the depth of the cup alone."""
@@ -106,7 +103,7 @@ def run(
     config = tiny()
     settings = dataclasses.replace(config.self_supervision, **changes)  # type: ignore[arg-type]
     pair = (networks["teacher"], networks["student"])
-    adapted = self_supervise(crops_of(path, config), cup, *pair, out, settings, silent)
+    adapted = self_supervise(crops_of(path, config), cup, *pair, out, settings)
     return json.loads(adapted.with_suffix(".log.jsonl").read_text().splitlines()[-1]), adapted
 
 
@@ -198,14 +195,15 @@ def test_a_stopped_adaptation_goes_on_as_if_nothing_had_happened(
         """The losses by step."""
         seen: dict[int, dict[str, float]] = {}
 
-        def note(step: int, steps: int, values: dict[str, float]) -> None:
-            del steps
-            seen[step] = dict(values)
-            if step == stop:
+        def note(label: str, done: int, total: int, values: Mapping[str, float]) -> None:
+            del label, total
+            seen[done] = dict(values)
+            if done == stop:
                 raise KeyboardInterrupt
 
+        pair = (networks["teacher"], networks["student"])
         with contextlib.suppress(KeyboardInterrupt):
-            self_supervise(crops, cup, networks["teacher"], networks["student"], out, settings, note)
+            self_supervise(crops, cup, *pair, out, settings, report=note)
         return seen
 
     whole, stopped = curve(tmp_path / "whole"), curve(tmp_path / "stopped", stop=3)
@@ -237,7 +235,7 @@ def test_the_mean_teacher_moves_by_the_decay_and_has_no_gradient() -> None:
 
 def test_labels_made_over_all_crops_are_those_of_each_batch(cup_session: Path, cup: ObjectModel) -> None:
     config, mesh = tiny(), RenderMesh.from_mesh(cup.mesh)
-    crops = labelled_crops([cup_session], cup, config.input, on_step=silent)
+    crops = labelled_crops([cup_session], cup, config.input)
     teacher = build_teacher(config).eval()
     labels = make_labels(teacher, crops, cup, mesh, config)
     assert labels.rotation.shape == (8, 3, 3)
@@ -265,7 +263,7 @@ def test_the_rgbd_baseline_adapts_by_appearance_and_depth(
 ) -> None:
     config = tiny("rgb")
     crops = crops_of(with_depth, config)
-    out = self_supervise_rgbd(crops, cup, baseline["teacher"], baseline["student"], tmp_path, on_step=silent)
+    out = self_supervise_rgbd(crops, cup, baseline["teacher"], baseline["student"], tmp_path)
     last = json.loads(out.with_suffix(".log.jsonl").read_text().splitlines()[-1])
     assert {"pose", "mask", "chamfer", "colour", "structure"} < set(last)
     assert "perceptual" not in last
@@ -287,7 +285,7 @@ def test_the_baseline_uses_lpips_where_its_weights_are_named(
     weights = str(stored_weights(tmp_path / "lpips.safetensors"))
     settings = dataclasses.replace(config.self6d, steps=1, lpips_weights=weights)
     networks = (baseline["teacher"], baseline["student"])
-    out = self_supervise_rgbd(crops_of(with_depth, config), cup, *networks, tmp_path, settings, silent)
+    out = self_supervise_rgbd(crops_of(with_depth, config), cup, *networks, tmp_path, settings)
     assert json.loads(out.with_suffix(".log.jsonl").read_text().splitlines()[-1])["perceptual"] > 0
 
 
@@ -307,7 +305,7 @@ def test_the_baseline_refuses_polarization_and_missing_depth(
 
 
 def test_the_signal_of_a_specular_cup_is_seen(cup_session: Path, cup: ObjectModel) -> None:
-    crops = labelled_crops([cup_session], cup, tiny().input, on_step=silent)
+    crops = labelled_crops([cup_session], cup, tiny().input)
     figures = labelled_signal(crops, torch.arange(8), cup)
     assert figures.images == 8
     assert figures.dolp_residual < 0.5 * figures.dolp_residual_shuffled
@@ -317,7 +315,7 @@ def test_the_signal_of_a_specular_cup_is_seen(cup_session: Path, cup: ObjectMode
 
 
 def test_unpolarized_light_is_warned_about(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
-    crops = labelled_crops([cup_session], cup, tiny().input, on_step=silent)
+    crops = labelled_crops([cup_session], cup, tiny().input)
     faint = crops.stokes.clone()
     noise = torch.randn(faint[:, 1:].shape, generator=torch.Generator().manual_seed(0))
     faint[:, 1:] = (0.02 * faint[:, :1] * noise).to(faint.dtype)
@@ -336,7 +334,7 @@ def test_unpolarized_light_is_warned_about(cup_session: Path, cup: ObjectModel, 
 def test_only_a_loss_on_dolp_alone_is_said_to_be_blind(
     cup_session: Path, cup: ObjectModel, physics: PhysicsVariant
 ) -> None:
-    crops = labelled_crops([cup_session], cup, tiny().input, on_step=silent)
+    crops = labelled_crops([cup_session], cup, tiny().input)
     figures = labelled_signal(crops, torch.arange(8), cup)
     diluted = dataclasses.replace(figures, dolp_residual=figures.dolp_residual_shuffled)
     assert "L_physics" in str(objection(diluted))
@@ -372,7 +370,7 @@ def test_saturated_pixels_are_no_measurement(cup_session: Path, monkeypatch: pyt
 
 
 def test_depth_is_cut_on_the_grid_of_the_crops(with_depth: Path, cup: ObjectModel) -> None:
-    crops = labelled_crops([with_depth], cup, tiny().input, on_step=silent)
+    crops = labelled_crops([with_depth], cup, tiny().input)
     assert crops.depth is not None
     covered = (crops.normals.norm(dim=1) > 0.5) & (crops.depth[:, 0] > 0)
     assert covered.float().mean() > 0.1
@@ -390,7 +388,7 @@ def test_depth_losses_pull_an_object_that_is_too_far_nearer(
     depth: Literal["chamfer", "pixel"], with_depth: Path, cup: ObjectModel
 ) -> None:
     config = tiny()
-    crops = labelled_crops([with_depth], cup, config.input, on_step=silent)
+    crops = labelled_crops([with_depth], cup, config.input)
     mesh, rows = RenderMesh.from_mesh(cup.mesh), torch.arange(2)
     seen = form_input(crops, rows, View.centred(2, 1.4), 1.5, config)
     assert seen.depth is not None
@@ -411,9 +409,9 @@ def test_depth_losses_pull_an_object_that_is_too_far_nearer(
 def test_networks_that_see_depth_want_it(cup_session: Path, with_depth: Path, cup: ObjectModel) -> None:
     config = tiny("rgbd")
     with pytest.raises(ToolkitError, match="has no depth, and these networks see it"):
-        labelled_crops([cup_session], cup, config.input, on_step=silent)
+        labelled_crops([cup_session], cup, config.input)
     assert isinstance(build_student(config), torch.nn.Module)
     assert isinstance(build_student(tiny(student="large")), Teacher)
     with h5py.File(with_depth) as file:
         assert "depth" in file
-    assert labelled_crops([with_depth], cup, config.input, on_step=silent).depth is not None
+    assert labelled_crops([with_depth], cup, config.input).depth is not None

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 
@@ -68,21 +69,17 @@ def tiny() -> ExperimentConfig:
     )
 
 
-def silent(step: int, steps: int, values: dict[str, float]) -> None:
-    del step, steps, values
-
-
 @pytest.fixture(scope="module")
 def crops(cup_session: Path, cup: ObjectModel) -> LabelledCrops:
-    return labelled_crops([cup_session], cup, tiny().input, on_step=silent)
+    return labelled_crops([cup_session], cup, tiny().input)
 
 
 @pytest.fixture(scope="module")
 def trained(cup_session: Path, cup: ObjectModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with teacher and student of 24 steps, and their logs."""
     out = tmp_path_factory.mktemp("trained")
-    train_teacher([cup_session], cup, tiny(), out, on_step=silent)
-    train_student([cup_session], cup, tiny(), out, on_step=silent)
+    train_teacher([cup_session], cup, tiny(), out)
+    train_student([cup_session], cup, tiny(), out)
     return out
 
 
@@ -104,10 +101,10 @@ def test_crops_show_the_object_where_their_pose_says(crops: LabelledCrops, cup: 
 
 
 def test_crops_are_kept_for_the_next_call(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
-    first = labelled_crops([cup_session], cup, tiny().input, tmp_path, silent)
+    first = labelled_crops([cup_session], cup, tiny().input, tmp_path)
     (stored,) = tmp_path.iterdir()
     before = stored.stat().st_mtime_ns
-    second = labelled_crops([cup_session], cup, tiny().input, tmp_path, silent)
+    second = labelled_crops([cup_session], cup, tiny().input, tmp_path)
     assert stored.stat().st_mtime_ns == before
     a, b = first.tensors(), second.tensors()
     assert all(torch.equal(a[name], b[name]) for name in a | b)
@@ -280,17 +277,17 @@ def test_a_killed_training_goes_on_as_if_nothing_had_happened(
 def test_a_resume_file_of_other_settings_is_refused(
     cup_session: Path, cup: ObjectModel, tmp_path: Path
 ) -> None:
-    def stop(step: int, steps: int, values: dict[str, float]) -> None:
-        del steps, values
-        if step == 3:
+    def stop(label: str, done: int, total: int, values: Mapping[str, float]) -> None:
+        del total, values
+        if label == "student" and done == 3:
             raise KeyboardInterrupt
 
     experiment = dataclasses.replace(tiny(), student=dataclasses.replace(tiny().student, checkpoint_every=2))
     with pytest.raises(KeyboardInterrupt):
-        train_student([cup_session], cup, experiment, tmp_path, on_step=stop)
+        train_student([cup_session], cup, experiment, tmp_path, report=stop)
     other = dataclasses.replace(experiment, student=dataclasses.replace(experiment.student, seed=1))
     with pytest.raises(ToolkitError, match="other settings"):
-        train_student([cup_session], cup, other, tmp_path, on_step=silent)
+        train_student([cup_session], cup, other, tmp_path)
 
 
 def test_a_warm_start_takes_the_teachers_encoders(
@@ -301,19 +298,19 @@ def test_a_warm_start_takes_the_teachers_encoders(
     )
     experiment = dataclasses.replace(tiny(), student=student)
     with pytest.raises(ToolkitError, match="warm_start"):
-        train_student([cup_session], cup, experiment, tmp_path, on_step=silent)
+        train_student([cup_session], cup, experiment, tmp_path)
     teacher = trained / "teacher.safetensors"
     other = dataclasses.replace(experiment, input=dataclasses.replace(experiment.input, aolp="angle"))
     with pytest.raises(ToolkitError, match="encoders see other channels"):
-        train_student([cup_session], cup, other, tmp_path, teacher=teacher, on_step=silent)
-    path = train_student([cup_session], cup, experiment, tmp_path, teacher=teacher, on_step=silent)
+        train_student([cup_session], cup, other, tmp_path, teacher=teacher)
+    path = train_student([cup_session], cup, experiment, tmp_path, teacher=teacher)
     wanted, found = load_file(teacher), load_file(path)
     stem = "encoder.polarization.stem.0.weight"
     assert torch.equal(wanted[stem], found[stem])
 
 
 def test_the_detector_learns(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
-    train_detector([cup_session], cup, tiny(), tmp_path, on_step=silent)
+    train_detector([cup_session], cup, tiny(), tmp_path)
     log = log_of(tmp_path / "detector.log.jsonl")
     assert log[-1]["total"] < 0.8 * log[0]["total"]
 
@@ -374,7 +371,7 @@ def test_self_supervision_cannot_see_captured_poses(
     for path in (cup_session, blind):
         with Session.open(path) as session:
             crops = captured_crops(session, range(8), found, tiny().input)
-        out = self_supervise(crops, cup, *networks, tmp_path / path.stem, on_step=silent)
+        out = self_supervise(crops, cup, *networks, tmp_path / path.stem)
         weights.append(load_file(out))
     assert len(crops) == 7
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
@@ -400,4 +397,4 @@ def test_nothing_detected_is_said_clearly(cup_session: Path) -> None:
 
 def test_an_object_the_session_lacks_is_said_clearly(cup_session: Path) -> None:
     with pytest.raises(ToolkitError, match="knife"):
-        labelled_crops([cup_session], build("knife"), tiny().input, on_step=silent)
+        labelled_crops([cup_session], build("knife"), tiny().input)

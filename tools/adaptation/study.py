@@ -99,19 +99,19 @@ def train_network(study: Study, what: str, seed: int) -> None:
     """Pre-trains a teacher, a student, or the detector."""
     config, model, cache = study.experiment(seed), objects.build(study.name), study.out / "crops"
     if what == "detector":
-        train_detector([study.detector_set], model, config, study.detector.parent, _silent)
+        train_detector([study.detector_set], model, config, study.detector.parent)
     elif what == TEACHER:
         out = study.checkpoint(TEACHER, seed).parent
-        train_teacher(study.training_sets(), model, config, out, cache, _silent)
+        train_teacher(study.training_sets(), model, config, out, cache=cache)
     else:
         out, teacher = study.checkpoint(BEFORE, seed).parent, study.checkpoint(TEACHER, seed)
-        train_student(study.training_sets(), model, config, out, cache, teacher, _silent)
+        train_student(study.training_sets(), model, config, out, teacher=teacher, cache=cache)
 
 
 def find_captured(study: Study, name: str) -> None:
     """Runs the detector over a captured set and keeps what it found."""
     with Session.open(study.set(name)) as session:
-        found = find_objects(session, range(len(session)), study.detector, study.name, _silent)
+        found = find_objects(session, range(len(session)), study.detector, study.name)
         shape = session.stokes(0).s0.shape
     masks = [np.zeros(shape, bool) if one is None else one.mask for one in found]
     boxes = [np.zeros(4) if one is None else one.box_xywh for one in found]
@@ -143,7 +143,7 @@ def adapt_network(study: Study, row: str, seed: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         save(path, network.state_dict(), CheckpointInfo.of("teacher", "AdaBN", model, 0, config, info.data))
     else:
-        self_supervise(crops, model, teacher, student, path.parent, TRAINED[row](settings), _silent)
+        self_supervise(crops, model, teacher, student, path.parent, TRAINED[row](settings))
 
 
 def judge_network(study: Study, row: str, seed: int, what: str) -> None:
@@ -154,8 +154,8 @@ def judge_network(study: Study, row: str, seed: int, what: str) -> None:
         if what in study.captured:
             found = found_in(study, what)
         else:
-            found = find_objects(session, frames, study.detector, study.name, _silent)
-        run = evaluate(session, frames, model, network, found, _silent)
+            found = find_objects(session, frames, study.detector, study.name)
+        run = evaluate(session, frames, model, network, found)
     run.save(study.evaluation(row, seed, what))
 
 
@@ -237,10 +237,6 @@ def publish(name: str, result: dict[str, Any]) -> None:
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.json").write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
     write_page()
-
-
-def _silent(*_: object) -> None:
-    """Instead of a progress bar in a worker."""
 
 
 if __name__ == "__main__":

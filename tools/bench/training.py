@@ -22,7 +22,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -36,7 +36,7 @@ from s2p3.objects import ObjectModel, build
 from s2p3.training.crops import labelled_crops
 from s2p3.training.examples import CropSource
 from s2p3.training.loader import CropDataset, Steps
-from s2p3.training.loop import optimize
+from s2p3.training.loop import Run, optimize
 from s2p3.training.pretrain import LabelledData, SupervisedObjective, model_tensors
 
 _AHEAD, _TIMED = 4, 8
@@ -100,8 +100,8 @@ class Turns:
     alone: list[float] = field(default_factory=list)
     since: float = 0.0
 
-    def __call__(self, done: int, steps: int, values: dict[str, float]) -> None:
-        del steps, values
+    def __call__(self, label: str, done: int, total: int, values: Mapping[str, float]) -> None:
+        del label, total, values
         place = done % (_AHEAD + _TIMED)
         if place == _AHEAD:
             self.since = time.perf_counter()
@@ -129,7 +129,9 @@ def train(
     settings = StageConfig(steps=turns * (_AHEAD + _TIMED), batch=BATCH)
     clock = Turns(alone(data, objective, config))
     path = beside.with_name(type(source).__name__) / "student.safetensors"
-    optimize(build_student(config), data, objective, settings, path, "", "bench", workers=1, on_step=clock)
+    optimize(
+        build_student(config), data, objective, settings, Run("bench", path, "", workers=1, report=clock)
+    )
     return clock
 
 

@@ -122,8 +122,7 @@ def file_hash(path: Path) -> str:
 
 def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
     """Writes `path` (NAME.safetensors) and NAME.json, each atomically, the weights last; the weights' own
-    metadata says the same as NAME.json, so that no other
-    weights pass for these. The resume file is done with.
+    metadata says the same as NAME.json, so that no others pass for these. Deletes the resume file.
 
     Of several processes that train together the first one writes, and the others wait for it.
     """

@@ -22,7 +22,6 @@ import tyro
 from acquisition import typed_toml
 from dataset.errors import ToolkitError
 from s2p3.config import (
-    PRESETS,
     AugmentationConfig,
     DetectorConfig,
     ExperimentConfig,
@@ -33,6 +32,7 @@ from s2p3.config import (
     SelfSupervisionConfig,
     load,
 )
+from s2p3.presets import PRESETS
 
 Preset = Literal["fast", "paper", "quick"]
 OptionalPreset = Annotated[

@@ -2,7 +2,7 @@
 bound, on annotated captured ones.
 
 The paper supervises both by poses alone: point matching for the rotation, L1 for the translation. The
-teacher's dense losses (`dense_weight`) and the warm start are our choice; `s2p3.config.paper` turns them off.
+teacher's dense losses (`dense_weight`) and the warm start are our choice; `s2p3.presets.paper` has neither.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import pytest
 from dataset.errors import SessionError, ToolkitError
 from dataset.session import Session, write_split
 from dataset.validate import validate
-from s2p3 import config as presets
+from s2p3 import config, presets
 from s2p3.captured_stages import adapt, frames_of
 from s2p3.cli import main
 from s2p3.evaluation import Evaluation
@@ -31,7 +31,7 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # A threshold below every score: an untrained detector must report something for the rest to work on.
     detector = dataclasses.replace(base.detector, steps=2, batch=2, threshold=0.01, minimum_score=0.0)
     path = tmp_path_factory.mktemp("experiment") / "experiment.toml"
-    presets.save(
+    config.save(
         dataclasses.replace(base, detector=detector, teacher=few, student=few, self_supervision=again), path
     )
     return path

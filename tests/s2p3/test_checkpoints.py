@@ -12,8 +12,8 @@ import torch
 from safetensors.torch import load_file
 
 from dataset.errors import ToolkitError
-from s2p3 import config as presets
-from s2p3 import objects
+from s2p3 import objects, presets
+from s2p3.config import FrameSource
 from s2p3.evaluation import Estimator
 from s2p3.objects import ObjectModel
 from s2p3.symmetry import Symmetry
@@ -118,7 +118,7 @@ def test_a_session_counts_once(cup_session: Path, cup: ObjectModel, tmp_path: Pa
 
 
 def test_a_session_does_not_validate_itself(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
-    frames = presets.FrameSource(validation=str(cup_session))
+    frames = FrameSource(validation=str(cup_session))
     with pytest.raises(ToolkitError, match="this session was given before"):
         train_student([cup_session], cup, presets.quick(), tmp_path, frames=frames)
 

@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 
 from dataset.errors import ToolkitError
-from s2p3 import config
+from s2p3 import config, presets
 
 
-@pytest.mark.parametrize("name", config.PRESETS)
+@pytest.mark.parametrize("name", presets.PRESETS)
 def test_presets_survive_a_round_trip_through_toml(name: str, tmp_path: Path) -> None:
-    preset = config.PRESETS[name]()
+    preset = presets.PRESETS[name]()
     config.save(preset, tmp_path / "experiment.toml")
     assert config.load(tmp_path / "experiment.toml") == preset
 
 
 def test_the_paper_preset_holds_the_papers_values() -> None:
-    paper = config.paper()
+    paper = presets.paper()
     assert paper.input.size == 256
     assert paper.input.background == "mask"
     for stage, batch in ((paper.teacher, 8), (paper.student, 8), (paper.self_supervision, 4)):
@@ -34,7 +34,7 @@ def test_the_paper_preset_holds_the_papers_values() -> None:
 
 
 def test_the_baseline_has_the_published_weights() -> None:
-    baseline = config.paper().self6d
+    baseline = presets.paper().self6d
     assert (baseline.epochs, baseline.batch, baseline.learning_rate) == (100, 6, 1e-4)
     assert (baseline.schedule, baseline.clip_norm) == ("flat", 1.0)
     assert (baseline.pose_weight, baseline.mask_weight, baseline.chamfer_weight) == (10, 1, 100)
@@ -116,7 +116,7 @@ OUT_OF_RANGE = {
 
 @pytest.mark.parametrize("table", OUT_OF_RANGE)
 def test_a_number_out_of_range_is_refused_with_the_range(table: str) -> None:
-    base = getattr(config.fast(), table)
+    base = getattr(presets.fast(), table)
     numbers = {name for name, value in vars(base).items() if type(value) in (int, float)}
     assert numbers - {*OUT_OF_RANGE[table]} <= {"size", "total_stride", "seed"}  # none is forgotten
     for name, values in OUT_OF_RANGE[table].items():
@@ -134,7 +134,7 @@ def test_a_number_out_of_range_in_a_file_is_told_with_its_place(tmp_path: Path) 
 
 
 def test_the_ends_of_a_range_are_in_it() -> None:
-    base = config.fast()
+    base = presets.fast()
     dataclasses.replace(base.self_supervision, steps=0, epochs=0, threshold=1.0, smoothing=1, ema=0.0)
     dataclasses.replace(base.detector, level=32, threshold=0.0, minimum_score=1.0)
     dataclasses.replace(base.augmentation, zoom_min=1.6, shift=0.0, rotation_deg=180.0, blur=1.0, gain=0.0)

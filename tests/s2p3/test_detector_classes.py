@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dataset.errors import ToolkitError
 from dataset.session import Session
-from s2p3 import config as presets
+from s2p3 import presets
 from s2p3.cli import main
 from s2p3.evaluation import Finder
 from s2p3.networks.detector import CELL, detect

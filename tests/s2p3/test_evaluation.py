@@ -13,7 +13,7 @@ import pytest
 from calibration import html
 from dataset.errors import ToolkitError
 from dataset.session import Session, mask_box
-from s2p3 import config as presets
+from s2p3 import presets
 from s2p3.evaluation import Estimator, Evaluation, Finder, evaluate, find_objects
 from s2p3.evaluation.report import chosen_records, evaluation_section
 from s2p3.networks.build import build_student

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from acquisition import typed_toml
-from s2p3 import cli
-from s2p3 import config as presets
+from s2p3 import cli, presets
 from s2p3.commands.experiment import Part, named_in
 from s2p3.config import ExperimentConfig
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from dataset.errors import ToolkitError
-from s2p3.config import fast
 from s2p3.objects import build
+from s2p3.presets import fast
 from s2p3.training import loader
 from s2p3.training.crops import LabelledCrops, collate, labelled_crops
 from s2p3.training.loader import CropDataset, Share, Steps, stream

@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
-from s2p3 import config as presets
+from s2p3 import config, presets
 from s2p3.config import AugmentationConfig
 from s2p3.networks.teacher import TeacherOutput
 from s2p3.objects import ObjectModel
@@ -80,12 +80,12 @@ def test_two_processes_train_a_student_together(cup_session: Path, cup: ObjectMo
     BatchNorm is each one's own, so they are like those of one process, not equal."""
     base = presets.quick()
     few = replace(base.student, steps=2, batch=6, validations=1, holdout=0.25)
-    config = replace(base, student=few, augmentation=AugmentationConfig(1.4, 1.4, 0, 0, 0, 0, 0, 0))
-    presets.save(config, tmp_path / "experiment.toml")
+    experiment = replace(base, student=few, augmentation=AugmentationConfig(1.4, 1.4, 0, 0, 0, 0, 0, 0))
+    config.save(experiment, tmp_path / "experiment.toml")
     words = ["train", "student", cup_session, "--object", "cup", "--config", tmp_path / "experiment.toml"]
     together, alone = tmp_path / "together", tmp_path / "alone"
     launch("-m", "s2p3", *words, "--workers", 0, "--out", together)
-    train_student([cup_session], cup, config, alone, cache=tmp_path)
+    train_student([cup_session], cup, experiment, alone, cache=tmp_path)
     files = [{path.name for path in folder.iterdir()} for folder in (together, alone)]
     assert files[0] == files[1] >= {"student.safetensors", "student.json", "student.log.jsonl"}
     (line,), (expected,) = (

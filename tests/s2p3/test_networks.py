@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from s2p3 import config as presets
+from s2p3 import presets
 from s2p3.inputs import channel_counts
 from s2p3.networks import Student, Teacher, build_student, build_teacher, detector, pose_head, pose_of
 from s2p3.networks.depthwise import DepthwiseConv

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from s2p3 import config as presets
+from s2p3 import presets
 from s2p3.config import ExperimentConfig, SelfSupervisionConfig
 from s2p3.inputs import View
 from s2p3.objects import ObjectModel

@@ -21,8 +21,7 @@ from dataset.errors import ToolkitError, ToolkitWarning
 from dataset.polarimetry import Stokes
 from dataset.session import Session, mask_box
 from dataset.session.edit import write_depth
-from s2p3 import config as presets
-from s2p3 import losses
+from s2p3 import losses, presets
 from s2p3.config import ExperimentConfig, PhysicsVariant
 from s2p3.inputs import View
 from s2p3.networks.build import build_student, build_teacher

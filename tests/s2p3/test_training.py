@@ -24,7 +24,7 @@ from safetensors.torch import load_file
 from dataset import SE3
 from dataset.errors import ToolkitError
 from dataset.session import Session, mask_box, write_split
-from s2p3 import config as presets
+from s2p3 import config, presets
 from s2p3.config import AugmentationConfig, ExperimentConfig, FrameSource
 from s2p3.inputs import View
 from s2p3.networks.detector import Detection
@@ -250,7 +250,7 @@ def test_a_killed_training_goes_on_as_if_nothing_had_happened(
 ) -> None:
     """A process of the command line, its batches made by a worker, killed by SIGKILL; the second one and the
     first one's log are, to the last bit, a training that was left alone and made its batches itself."""
-    presets.save(tiny(), tmp_path / "experiment.toml")
+    config.save(tiny(), tmp_path / "experiment.toml")
     words = ["train", "student", cup_session, "--object", "cup", "--config", tmp_path / "experiment.toml"]
     command = [sys.executable, "-m", "s2p3.cli", *words, "--out", tmp_path, "--workers", "1"]
     first = subprocess.Popen(command, stderr=subprocess.DEVNULL)

@@ -13,7 +13,7 @@ import trimesh
 
 from dataset.session import Session, write_split
 from dataset.session.edit import write_depth
-from s2p3 import config as presets
+from s2p3 import presets
 from s2p3.cli import main
 from s2p3.config import ExperimentConfig
 from s2p3.objects import ObjectModel, build

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from s2p3 import config as presets
+from s2p3 import presets
 from s2p3.config import ExperimentConfig
 from s2p3.networks.build import build_student, build_teacher
 from s2p3.networks.detector import Detector

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from timing import in_turns
 
-from s2p3 import config, physics
+from s2p3 import physics, presets
 from s2p3.evaluation.export import WORKING_SIZE
 from s2p3.inputs import channel_counts
 from s2p3.networks.build import build_student, build_teacher
@@ -33,7 +33,7 @@ def measure(rounds: int) -> dict[str, float]:
     """Median milliseconds, batch 1, and the ratio."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    settings = config.paper()
+    settings = presets.paper()
     side, (width, height) = settings.input.size, WORKING_SIZE
     seen = [torch.rand(1, channels, side, side) for channels in channel_counts(settings.input)]
     fast = [image.contiguous(memory_format=torch.channels_last) for image in seen]

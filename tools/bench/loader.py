@@ -23,10 +23,10 @@ import torch
 from dataset import SE3, CameraInfo, Intrinsics, RawFrame
 from dataset.polarimetry import Stokes, encode
 from dataset.session import ObjectPoses, Session, SessionWriter, mask_box, write_object, write_poses
-from s2p3.config import fast
 from s2p3.inputs import View
 from s2p3.networks.build import build_student
 from s2p3.objects import build
+from s2p3.presets import fast
 from s2p3.rendering import rasterize
 from s2p3.training.batches import form_input, form_targets
 from s2p3.training.crops import LabelledCrops

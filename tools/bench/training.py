@@ -30,9 +30,10 @@ from statistics import median
 import torch
 from loader import BATCH, OBJECT, write_session
 
-from s2p3.config import ExperimentConfig, StageConfig, fast
+from s2p3.config import ExperimentConfig, StageConfig
 from s2p3.networks.build import build_student
 from s2p3.objects import ObjectModel, build
+from s2p3.presets import fast
 from s2p3.training.crops import labelled_crops
 from s2p3.training.examples import CropSource
 from s2p3.training.loader import CropDataset, Steps

@@ -24,7 +24,7 @@ from dataset.session import ObjectPoses, ObjectRecord, Session
 from s2p3 import object_meshes
 from s2p3.materials import Kind, Material, load_material
 from s2p3.rendering.mesh import Mesh
-from s2p3.symmetry import Proposal, Symmetry, propose
+from s2p3.symmetry import Proposal, Symmetry, holds, propose
 
 if TYPE_CHECKING:
     import trimesh
@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 SAME_SIZE = 0.01
 """Share of the diameter by which two meshes of one object may differ: one may be simplified."""
 
-_SAME_INDEX = 0.005  # finer than anybody knows one
+SAME_INDEX = 0.005
+"""Difference of two refractive indices that counts as none: finer than anybody knows one."""
+
 _LARGEST_M, _SMALLEST_M = 2.0, 0.005
 _PROPOSAL_POINTS = 150_000
 
@@ -99,6 +101,10 @@ class ObjectModel:
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
         """(count, 3) points drawn uniformly over the surface, the same for the same seed."""
         return self._drawn(count, seed)[0]
+
+    def has_its_symmetry(self) -> bool:
+        """Whether the declared motions map the surface onto itself, to `symmetry.TOLERANCE`."""
+        return holds(self.symmetry, self._drawn(_PROPOSAL_POINTS, 0), self.diameter)
 
     def proposed_symmetry(self) -> Proposal:
         """What the mesh looks symmetric under: for its user to accept, never assumed."""
@@ -200,7 +206,7 @@ def poses_of(session: Session, model: ObjectModel) -> ObjectPoses:
         ToolkitError: it was annotated with a mesh of another size, or placed otherwise in its frame, so that
             its poses are not this object's; or the session knows a symmetry that the object lacks.
 
-    Warns (ToolkitWarning) where the session has another refractive index.
+    Warns (ToolkitWarning) where the session has another refractive index, or lacks a symmetry.
     """
     poses, record = session.object_poses(model.name), session.object(model.name)
     theirs, ours = (np.stack([v.min(axis=0), v.max(axis=0)]) for v in (record.vertices, model.vertices))
@@ -216,12 +222,18 @@ def poses_of(session: Session, model: ObjectModel) -> ObjectPoses:
             f"{session.path}: its {model.name!r} has a symmetry that the mesh given lacks; write it into the "
             f"material file beside the mesh: {' '.join(symmetry.toml.splitlines())}"
         )
-    if abs(record.refractive_index - model.refractive_index) > _SAME_INDEX:
+    if abs(record.refractive_index - model.refractive_index) > SAME_INDEX:
         warnings.warn(
             f"{session.path}: its {model.name!r} has the refractive index {record.refractive_index:g}; "
             f"{model.refractive_index:g} is used, which a material file beside the mesh can change",
             ToolkitWarning,
-            stacklevel=2,
+            stacklevel=1,  # said once, however often the poses are read
+        )
+    if not symmetry.covers(model.symmetry):
+        warnings.warn(
+            f"{session.path}: its {model.name!r} lacks a symmetry that the one given has, which is used",
+            ToolkitWarning,
+            stacklevel=1,
         )
     return poses
 

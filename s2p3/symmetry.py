@@ -179,11 +179,19 @@ def propose(surface: tuple[Array, Array], vertices: Array, diameter: float) -> P
     return Proposal(None, _named(closed(turns)), worst, offset)
 
 
+def holds(symmetry: Symmetry, surface: tuple[Array, Array], diameter: float) -> bool:
+    """Whether a surface looks the same after every motion of `symmetry`; arguments as `propose`."""
+    motions = [SE3.from_matrix(motion) for motion in symmetry.transforms]
+    if symmetry.axis is not None:
+        motions += [SE3.from_rotvec(turn * symmetry.axis, np.zeros(3)) for turn in _ODD_TURNS]
+    return _Likeness(*surface, TOLERANCE * diameter).worst(motions) is not None
+
+
 class _Likeness:
     """How far a turned surface lies from itself.
 
     Args:
-        points, normals: (n, 3) over the surface, about its centroid.
+        points, normals: (n, 3) over the surface, about the centre of the turns.
         limit: metres; beyond it, it is another shape.
     """
 

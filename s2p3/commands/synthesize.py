@@ -93,9 +93,11 @@ def _prepared(name: str, mesh: Path | None, material: Path | None, simplify_mm: 
     if mesh is not None:
         size = f"{1000 * model.diameter:.1f} mm across, {len(model.faces)} faces, watertight"
         say(f"{name}: {size}; {model.material} of index {model.refractive_index:g}")
-        proposal = model.proposed_symmetry()
-        if proposal.any and not model.symmetry.any:
-            say(f"{name}: {proposal}; if you agree, add to {mesh.with_suffix('.toml')}:\n{proposal.toml}")
+        proposal, declared = model.proposed_symmetry(), model.has_its_symmetry()
+        if not declared:
+            say(f"{name}: warning: the symmetry in its material file is not that of its shape, but is used")
+        if proposal.any and not (model.symmetry.any and declared):
+            say(f"{name}: {proposal}; if you agree, write into its material file:\n{proposal.toml}")
     if simplify_mm is None:
         return model
     fewer = simplify(model, simplify_mm / 1000)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -18,9 +17,11 @@ from torch import Tensor, nn
 from acquisition import typed_toml
 from dataset.errors import ToolkitError
 from s2p3.config import ExperimentConfig
-from s2p3.objects import SAME_SIZE, ObjectModel
+from s2p3.objects import SAME_INDEX, SAME_SIZE, ObjectModel
 from s2p3.provenance import toolkit_state
+from s2p3.symmetry import Symmetry
 from s2p3.training.ranks import have_met, is_first
+from s2p3.writable import check_folder
 
 Kind = Literal["teacher", "student", "detector"]
 Network = TypeVar("Network", bound=nn.Module)
@@ -61,6 +62,7 @@ class CheckpointInfo:
         commit: of the toolkit.
         validation: None where the last weights were kept.
         classes: of a detector, its objects in the order of its masks.
+        symmetry: of the object, as `Symmetry.to_json` says it; empty in checkpoints that do not say.
     """
 
     kind: Kind
@@ -74,6 +76,7 @@ class CheckpointInfo:
     commit: str = "unknown"
     validation: Validation | None = None
     classes: tuple[str, ...] = ()
+    symmetry: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -102,14 +105,16 @@ class CheckpointInfo:
             data,
             toolkit_state(),
             validation,
+            symmetry=model.symmetry.to_json(),
         )
 
 
 def to_write(path: Path) -> Path:
     """`path`, where a training may leave its checkpoint, or goes on.
 
-    Raises ToolkitError: a finished one has left its there.
+    Raises ToolkitError: a finished one has left its there, or its folder cannot be made.
     """
+    check_folder(path.parent)
     if path.exists() and not path.with_suffix(RESUME).exists():
         raise ToolkitError(f"{path} is there already; delete it to train anew, or choose another folder")
     return path
@@ -132,7 +137,6 @@ def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
         text = json.dumps(description, indent=1)
         save_text(path.with_suffix(".json"), text)
         save_tensors(path, weights, {_DESCRIPTION: text})
-        shutil.copymode(path.with_suffix(".json"), path)  # safetensors writes for the owner only
         path.with_suffix(RESUME).unlink(missing_ok=True)
     if have_met():
         dist.barrier()
@@ -146,10 +150,24 @@ def save_text(path: Path, text: str) -> None:
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Writes a safetensors file atomically: a reader sees the old file or the new one."""
+    """Writes a safetensors file atomically: a reader sees the old file or the new one.
+
+    Raises ToolkitError: it cannot be written.
+    """
     temporary = path.with_name(f"{path.name}.{os.getpid()}.part")  # several processes may write the same
-    save_file({name: tensor.detach().contiguous() for name, tensor in tensors.items()}, temporary, metadata)
-    temporary.replace(path)
+    try:
+        temporary.touch()
+        mode = temporary.stat().st_mode
+        save_file(
+            {name: tensor.detach().contiguous() for name, tensor in tensors.items()}, temporary, metadata
+        )
+        temporary.chmod(mode)  # safetensors writes for the owner only
+        temporary.replace(path)
+    except (OSError, SafetensorError) as error:
+        temporary.unlink(missing_ok=True)
+        raise ToolkitError(
+            f"{path}: cannot be written ({error}); check the disk's space and who may write there"
+        ) from error
 
 
 def read_info(
@@ -161,8 +179,10 @@ def read_info(
         wanted: the object, or its name.
 
     Raises ToolkitError: missing, damaged or foreign files; a network of another kind than `kind`, of another
-        object than the one wanted, or of an object of that name of another size.
+        object than the one wanted, or of one of that name of another size, refractive index or symmetry.
     """
+    if path.suffix not in (".safetensors", ".onnx"):
+        raise ToolkitError(f"{path}: is no checkpoint; give NAME.safetensors, or NAME.onnx")
     description = path.with_suffix(".json")
     for needed in (path, description):
         if not needed.is_file():
@@ -184,13 +204,30 @@ def read_info(
             f"train a {info.kind} for {name!r}"
         )
     if isinstance(wanted, ObjectModel) and info.kind != "detector":
-        trained, given = 1000 * info.diameter_m, 1000 * wanted.diameter
-        if abs(trained - given) > SAME_SIZE * given:
-            raise ToolkitError(
-                f"{path}: was trained for a {name!r} of {trained:.1f} mm, and this one has {given:.1f} mm; "
-                "give the mesh it was trained with, or train again"
-            )
+        _check_object(path, info, wanted)
     return info
+
+
+def _check_object(path: Path, info: CheckpointInfo, wanted: ObjectModel) -> None:
+    """Raises ToolkitError: the network was trained for another object of that name."""
+    advice = "give the mesh and the material file it was trained with, or train again"
+    trained, given = 1000 * info.diameter_m, 1000 * wanted.diameter
+    if abs(trained - given) > SAME_SIZE * given:
+        raise ToolkitError(
+            f"{path}: was trained for a {wanted.name!r} of {trained:.1f} mm, and this one has {given:.1f} mm;"
+            f" {advice}"
+        )
+    trained, given = info.refractive_index, wanted.refractive_index
+    if abs(trained - given) > SAME_INDEX:
+        raise ToolkitError(
+            f"{path}: was trained for a {wanted.name!r} of refractive index {trained:g}, and this one has "
+            f"{given:g}; {advice}"
+        )
+    symmetry = Symmetry.from_json(info.symmetry) if info.symmetry else wanted.symmetry
+    if not (symmetry.covers(wanted.symmetry) and wanted.symmetry.covers(symmetry)):
+        raise ToolkitError(
+            f"{path}: was trained for a {wanted.name!r} of another symmetry than this one has; {advice}"
+        )
 
 
 def _info(text: str, description: Path) -> CheckpointInfo:

@@ -6,7 +6,9 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -82,6 +84,69 @@ def test_a_network_of_a_larger_cup_is_refused(networks: dict[str, Path], cup: Ob
             load(networks["student"], larger(cup, 1.3))
 
 
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (
+            {"refractive_index": 1.6},
+            r"of refractive index 1.5, and this one has 1.6; give the mesh and the mat",
+        ),
+        (
+            {"symmetry": Symmetry(axis=np.array([0.0, 0.0, 1.0]))},
+            "of another symmetry than this one has; give",
+        ),
+    ],
+)
+def test_a_network_of_a_cup_of_another_kind_is_refused(
+    networks: dict[str, Path], cup: ObjectModel, change: dict[str, Any], complaint: str
+) -> None:
+    with pytest.raises(ToolkitError, match=complaint):
+        load_student(networks["student"], dataclasses.replace(cup, **change))
+
+
+def test_a_network_that_says_nothing_of_symmetry_is_taken(
+    networks: dict[str, Path], cup: ObjectModel
+) -> None:
+    info = dataclasses.replace(checkpoint.read_info(networks["student"]), symmetry="")
+    checkpoint.save(networks["student"], load_file(networks["student"]), info)
+    turning = dataclasses.replace(cup, symmetry=Symmetry(axis=np.array([0.0, 0.0, 1.0])))
+    load_student(networks["student"], turning)
+
+
+@pytest.mark.parametrize("name", ["cup.h5", "student.json"])
+def test_what_is_no_checkpoint_is_called_so(networks: dict[str, Path], name: str) -> None:
+    with pytest.raises(ToolkitError, match=rf"{name}: is no checkpoint; give NAME.safetensors"):
+        load_student(networks["student"].with_name(name))
+
+
+def test_everybody_may_read_what_is_written(
+    networks: dict[str, Path], cup_session: Path, cup: ObjectModel
+) -> None:
+    folder = networks["student"].parent
+    labelled_crops([cup_session], cup, presets.quick().input, folder)
+    (folder / "text").touch()
+    usual = (folder / "text").stat().st_mode
+    assert {path.stat().st_mode for path in folder.iterdir()} == {usual}
+
+
+def test_a_place_that_cannot_be_written_is_told(tmp_path: Path, cup_session: Path, cup: ObjectModel) -> None:
+    with pytest.raises(ToolkitError, match=r"/proc/net.safetensors: cannot be written .*disk's space"):
+        checkpoint.save_tensors(Path("/proc/net.safetensors"), {"weight": torch.zeros(3)})
+    (tmp_path / "file").touch()
+    with pytest.raises(ToolkitError, match=r"file is a file, and a folder is needed in its place"):
+        train_student([cup_session], cup, presets.quick(), tmp_path / "file" / "runs")
+
+
+def test_damaged_kept_crops_are_made_anew(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
+    config = presets.quick().input
+    before = labelled_crops([cup_session], cup, config, tmp_path)
+    (kept,) = tmp_path.glob("crops-*.safetensors")
+    whole = kept.read_bytes()
+    kept.write_bytes(whole[: len(whole) // 2])
+    assert torch.equal(labelled_crops([cup_session], cup, config, tmp_path).stokes, before.stokes)
+    assert kept.read_bytes() == whole
+
+
 def test_a_session_of_a_larger_cup_is_refused(cup_session: Path, cup: ObjectModel) -> None:
     with pytest.raises(ToolkitError, match="'cup' has another mesh than the one given"):
         labelled_crops([cup_session], larger(cup, 1.3), presets.quick().input)
@@ -121,6 +186,18 @@ def test_a_session_does_not_validate_itself(cup_session: Path, cup: ObjectModel,
     frames = FrameSource(validation=str(cup_session))
     with pytest.raises(ToolkitError, match="this session was given before"):
         train_student([cup_session], cup, presets.quick(), tmp_path, frames=frames)
+
+
+def test_a_detector_knows_an_object_once(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
+    with pytest.raises(ToolkitError, match="cup, cup: an object is named twice"):
+        train_detector([cup_session], [cup, cup], presets.quick(), tmp_path)
+
+
+def test_frames_to_score_on_are_named_for_a_use(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
+    base = presets.quick()
+    config = dataclasses.replace(base, student=dataclasses.replace(base.student, validations=0))
+    with pytest.raises(ToolkitError, match="validations = 0 scores nothing on 'test'"):
+        train_student([cup_session], cup, config, tmp_path, frames=FrameSource(validation="test"))
 
 
 def test_a_finished_checkpoint_is_not_overwritten(

@@ -209,6 +209,18 @@ def test_what_follows_from_a_turn_is_a_symmetry_too(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sort(np.linalg.norm(turns, axis=1)), np.radians([90, 90, 180]), atol=1e-9)
 
 
+_FLIP = np.diag([1.0, -1, -1, 1])[None, None]
+
+
+def test_a_declared_symmetry_is_held_against_the_shape() -> None:
+    bottle, cup = objects.build("bottle"), objects.build("cup")
+    assert bottle.has_its_symmetry()
+    assert cup.has_its_symmetry()  # it has none
+    assert not replace(cup, symmetry=bottle.symmetry).has_its_symmetry()
+    assert not replace(bottle, symmetry=objects.Symmetry(*_FLIP)).has_its_symmetry()
+    assert replace(_block((0.1, 0.05, 0.02)), symmetry=objects.Symmetry(*_FLIP)).has_its_symmetry()
+
+
 def test_a_session_tells_of_a_symmetry_that_the_mesh_lacks(tmp_path: Path) -> None:
     bottle = objects.build("bottle")
     path = tmp_path / "bottle.h5"
@@ -218,6 +230,9 @@ def test_a_session_tells_of_a_symmetry_that_the_mesh_lacks(tmp_path: Path) -> No
         assert len(objects.poses_of(session, bottle).visible_fraction) == 1
         with pytest.raises(ToolkitError, match=r"symmetry.*material file.*axis = \[0, 0, 1\]"):
             objects.poses_of(session, objects.named_object("bottle", mesh))
+        turning = replace(bottle, symmetry=objects.Symmetry(*_FLIP, axis=bottle.symmetry.axis))
+        with pytest.warns(ToolkitWarning, match="lacks a symmetry that the one given has"):
+            objects.poses_of(session, turning)
         (tmp_path / "bottle.toml").write_text("[symmetry]\naxis = [0, 0, -1]\n")
         with pytest.warns(ToolkitWarning, match="refractive index"):
             objects.poses_of(session, objects.named_object("bottle", mesh))

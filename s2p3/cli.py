@@ -124,15 +124,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"s2p3: {error}", file=sys.stderr)
         return _USER_MISTAKE
     except KeyboardInterrupt:
-        print("s2p3: interrupted; what was recorded or trained so far is on disk", file=sys.stderr)
+        print(
+            "s2p3: interrupted; what was recorded is on disk, and a training goes on from its last state",
+            file=sys.stderr,
+        )
         return _INTERRUPTED
     except BrokenPipeError:
         # Who read our output has gone; the interpreter must not find that out again when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
-        if error.filename is None:
-            raise
-        print(f"s2p3: {error.filename}: {error.strerror}; check the path and who may write", file=sys.stderr)
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"s2p3: {where}{error.strerror or error}; check the path and who may write", file=sys.stderr)
         return _USER_MISTAKE
     return 0
 

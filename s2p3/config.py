@@ -308,7 +308,13 @@ class Self6DConfig(StageConfig):
         )
 
 
-_OptionalName = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(optional)")]
+_OptionalName = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="NAME",
+        help_behavior_hint=lambda value: "(optional)" if value == "None" else f"(default: {value})",
+    ),
+]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from acquisition.recorder import OnProgress
     from acquisition.recorder import Progress as Recorded
 
+_QUIET_S = 60.0
+
 console = Console(stderr=True, highlight=False)
 """For people. Results that a script would read go to stdout."""
 
@@ -42,10 +45,13 @@ def counting(label: str) -> Iterator[Callable[[int, int], None]]:
 @contextmanager
 def progress_bars(labels: Iterable[str] = ()) -> Iterator[Report]:
     """A progress bar with an ETA for each of these labels, and for every other that the yielded function is
-    called with.
+    called with; where there is no terminal, a line now and then.
 
     Nothing is shown before the first call: a mistake found until then is told in one line.
     """
+    if not console.is_terminal:
+        yield _lines()
+        return
     columns = (
         TextColumn("  {task.description}"),
         BarColumn(),
@@ -63,10 +69,27 @@ def progress_bars(labels: Iterable[str] = ()) -> Iterator[Report]:
                 stack.enter_context(bars)
             if label not in tasks:
                 tasks[label] = bars.add_task(label, total=total, loss="")
-            loss = f"loss {values['total']:.3f}" if "total" in values else ""
-            bars.update(tasks[label], completed=done, total=total, loss=loss)
+            bars.update(tasks[label], completed=done, total=total, loss=_loss(values))
 
         yield report
+
+
+def _lines() -> Report:
+    """For log files: a line at the end of each work, and one a minute on the way."""
+    said: dict[str, tuple[str, float]] = {}
+
+    def report(label: str, done: int, total: int, values: Mapping[str, float]) -> None:
+        now, line = time.monotonic(), f"{label} {done}/{total} {_loss(values)}".rstrip()
+        last, when = said.setdefault(label, ("", now))
+        if line != last and (done == total or now > when + _QUIET_S):
+            said[label] = (line, now)
+            say(line)
+
+    return report
+
+
+def _loss(values: Mapping[str, float]) -> str:
+    return f"loss {values['total']:.3f}" if "total" in values else ""
 
 
 @contextmanager

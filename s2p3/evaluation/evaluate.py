@@ -84,10 +84,17 @@ class Evaluation:
         """
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise ToolkitError(f"{path}: no such file; name one that `s2p3 evaluate --out` wrote") from error
+        except (OSError, ValueError) as error:
+            raise ToolkitError(f"{path}: cannot be read ({error}); evaluate again") from error
+        try:
             subject = Subject(**content["subject"])
             return Evaluation.of([Record.from_json(row) for row in content["records"]], subject)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ToolkitError(f"{path} is no saved evaluation ({error}); evaluate again") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise ToolkitError(
+                f"{path} is no saved evaluation; name one that `s2p3 evaluate --out` wrote"
+            ) from error
 
 
 def find_objects(

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from dataset.errors import ToolkitError
 from s2p3.inputs import channel_counts
 from s2p3.networks.detector import detector_input, downsample
 from s2p3.networks.onnx_files import write_onnx
@@ -15,6 +16,7 @@ from s2p3.training import checkpoint
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.detection import load_detector
 from s2p3.training.pretrain import load_student, load_teacher
+from s2p3.writable import check_folder
 
 WORKING_SIZE = (612, 512)
 """(width, height) of the polarization image that a detector is exported for: the paper's."""
@@ -29,8 +31,11 @@ def export(path: Path, out: Path, image_size: tuple[int, int] = WORKING_SIZE) ->
     Returns:
         The largest relative difference from the checkpoint's network, see `write_onnx`.
 
-    Raises ToolkitError: no such checkpoint; the exported network differs.
+    Raises ToolkitError: no such checkpoint; `out` cannot be written; the exported network differs.
     """
+    if out.suffix != ".onnx" or out.is_dir():
+        raise ToolkitError(f"{out}: an exported network is a file NAME.onnx; name it so")
+    check_folder(out.parent)
     info = checkpoint.read_info(path)
     load = {"teacher": load_teacher, "student": load_student, "detector": load_detector}[info.kind]
     network: nn.Module = load(path)[0]

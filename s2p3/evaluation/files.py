@@ -12,6 +12,7 @@ from s2p3.evaluation.bop_results import bop_object_id, write_bop_results
 from s2p3.evaluation.evaluate import Evaluation
 from s2p3.evaluation.report import comparison_section, evaluation_section, groups_section
 from s2p3.objects import ObjectModel
+from s2p3.writable import check_folder
 
 
 def check_out(out: Path) -> None:
@@ -20,6 +21,7 @@ def check_out(out: Path) -> None:
         raise ToolkitError(f"{out} is a folder; name a JSON file, such as {out / 'test.json'}")
     if out.suffix in (".html", ".csv"):
         raise ToolkitError(f"{out}: the figures go into a JSON file; name it {out.with_suffix('.json')}")
+    check_folder(out.parent)
 
 
 def told_apart(paths: Sequence[Path]) -> list[str]:

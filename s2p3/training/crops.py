@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Container, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -145,7 +147,8 @@ def labelled_crops(
     """
     stored = None if cache is None else cache / f"crops-{fingerprint(paths, model, config)}.safetensors"
     if stored is not None and stored.exists():
-        return LabelledCrops(**load_file(stored))
+        with suppress(OSError, SafetensorError):  # damaged, or another's: made anew
+            return LabelledCrops(**load_file(stored))
     shown = shown_rows(paths, model)
     rows: list[dict[str, NDArray[np.generic]]] = []
     for number, path in enumerate(paths):

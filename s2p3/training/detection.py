@@ -107,6 +107,8 @@ def train_detector(
     """
     models = [models] if isinstance(models, ObjectModel) else list(models)
     names, settings = [model.name for model in models], config.detector
+    if len(set(names)) < len(names):
+        raise ToolkitError(f"{', '.join(names)}: an object is named twice; name each one once")
     path = checkpoint.to_write(out / "detector.safetensors")
     hashes = _hashes(sessions, models)
     frames = small_frames(sessions, names, settings.level, report)

@@ -105,6 +105,10 @@ def divide(
     nothing = torch.arange(0)
     validation = frames.validation
     if not settings.validations:
+        if validation is not None:
+            raise ToolkitError(
+                f"validations = 0 scores nothing on {validation!r}; raise it, or leave --validation out"
+            )
         return Division(rows, nothing, None, "")
     if validation is None:
         count = min(int(settings.holdout * len(rows)), MOST_HELD_OUT)

@@ -12,7 +12,9 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Generator, Sequence
+import threading
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -183,7 +185,9 @@ def stream(steps: Steps, first: int, last: int, workers: int = 0) -> Generator[A
         multiprocessing_context="spawn" if workers else None,
         generator=torch.Generator(),  # or the loader would draw from, and so change, the global one
     )
-    for made in loader:
+    with _deaf_to_interrupts():
+        batches = iter(loader)
+    for made in batches:
         if isinstance(made, _Failed):
             raise ToolkitError(made.why)
         yield made
@@ -221,14 +225,26 @@ class _Telling(Dataset[Any]):
             return _Failed(str(error))
 
 
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Processes that are started meanwhile leave Ctrl-C, which a terminal sends to all, to this one."""
+    if threading.current_thread() is not threading.main_thread():  # which alone may change handlers
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _as_it_is(batch: Any) -> Any:
     return batch
 
 
 def _alone(_: int) -> None:
-    """A worker has one thread, and leaves Ctrl-C to the process that started it."""
+    """A worker has one thread."""
     import cv2
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

@@ -151,6 +151,8 @@ def test_what_cannot_stand_beside_is_refused(
     (tmp_path / "not.json").write_text("{}")
     line = refusal([*words(session, networks), "--beside", str(tmp_path / "not.json")], capfd)
     assert "is no saved evaluation" in line
+    line = refusal([*words(session, networks), "--beside", str(tmp_path / "gone.json")], capfd)
+    assert "gone.json: no such file" in line
 
 
 @pytest.mark.parametrize(

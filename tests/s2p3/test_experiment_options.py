@@ -100,5 +100,10 @@ def test_help_lists_the_fields_a_stage_depends_on(capfd: pytest.CaptureFixture[s
         cli.main(["train", "student", "--preset", "paper", "--help"])
     text = " ".join(capfd.readouterr().out.replace("│", " ").split())
     assert "--config.student.learning-rate FLOAT The peak of the schedule. (default: 0.0001)" in text
+    assert "--split NAME Train on this split of the sessions only. (optional)" in text
     assert "--config.teacher" not in text
     assert "--config.detector" not in text
+    with pytest.raises(SystemExit):
+        cli.main(["train", "supervised", "--help"])
+    text = " ".join(capfd.readouterr().out.replace("│", " ").split())
+    assert "--split NAME Train on this split of the sessions only. (default: train)" in text

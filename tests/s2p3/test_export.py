@@ -57,6 +57,14 @@ def test_an_exported_student_estimates_what_the_checkpoint_does(
     np.testing.assert_allclose(a, b, atol=1e-4)
 
 
+@pytest.mark.parametrize("name", ["", "student", "student.pt"])
+def test_a_place_for_another_kind_of_file_is_refused_at_once(
+    name: str, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", str(networks["student"]), "--out", str(tmp_path / name)]) == 2
+    assert "an exported network is a file NAME.onnx; name it so" in capfd.readouterr().err
+
+
 def test_an_exported_file_keeps_to_its_description(
     exported: Path, tmp_path: Path, networks: dict[str, Path]
 ) -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pickle
 import runpy
+import signal
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -109,6 +112,18 @@ class Rows:
     def __call__(self, rows: Tensor, generator: torch.Generator) -> list[int]:
         del generator
         return rows.tolist()
+
+
+def test_workers_leave_ctrl_c_to_who_started_them() -> None:
+    asked = [sys.executable, "-c", "import signal; print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with loader._deaf_to_interrupts():
+            started = subprocess.run(asked, capture_output=True, text=True, check=True)
+        assert started.stdout == "True\n"
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_too_little_shared_memory_is_said_before_it_kills(monkeypatch: pytest.MonkeyPatch) -> None:

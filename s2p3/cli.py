@@ -172,8 +172,13 @@ def _dispatch(words: list[str]) -> None:
 
 def _run(verbs: dict[str, Verb], prog: str, description: str, words: list[str]) -> None:
     config = (tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
-    verbs = {name: with_defaults(verb, words) for name, verb in verbs.items()}
-    tyro.extras.subcommand_cli_from_dict(verbs, prog=prog, description=description, args=words, config=config)
+    if words and words[0] in verbs:  # alone, so that a mistake is answered with this verb's options only
+        verb = with_defaults(verbs[words[0]], words)
+        tyro.cli(verb, prog=f"{prog} {words[0]}", args=words[1:], config=config)
+    else:
+        tyro.extras.subcommand_cli_from_dict(
+            verbs, prog=prog, description=description, args=words, config=config
+        )
 
 
 def _as_verb(verb: Verb | Group) -> Verb:

@@ -55,7 +55,7 @@ class Plan:
     """How much of everything; the demo's answer to "how long have I got"."""
 
     preset: str
-    """Training preset of s2p3.config."""
+    """Of `s2p3.presets`, for the trainings."""
     board_views: int
     motion_s: float
     """Seconds of filming the board while the arm moves, for the clock offset."""

@@ -154,8 +154,9 @@ def cycle(found: dict[str, list[Import]]) -> list[str]:
     return []
 
 
-def test_no_imports_of_the_method_run_in_a_ring() -> None:
-    ring = cycle({module_name(path): imports_of(path) for path in files("s2p3")})
+@pytest.mark.parametrize("room", ROOMS)
+def test_no_imports_of_a_room_run_in_a_ring(room: str) -> None:
+    ring = cycle({module_name(path): imports_of(path) for path in files(room)})
     assert not ring, " is imported by ".join(ring)
 
 

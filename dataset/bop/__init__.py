@@ -1,7 +1,6 @@
-"""The scenewise format of the BOP benchmark: sessions to it, and back."""
+"""The scenewise format of the BOP benchmark; `dataset.importers` reads it back."""
 
 from dataset.bop.export import export_bop
-from dataset.bop.importing import import_bop
 from dataset.bop.scene import Drawn
 
-__all__ = ["Drawn", "export_bop", "import_bop"]
+__all__ = ["Drawn", "export_bop"]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dataset.bop.layout import MM, model_file, read_json, write_json
-from dataset.importers.meshes import read_mesh
+from dataset.meshes import read_mesh
 from dataset.session import ObjectRecord
 
 FOLDERS = ("models", "models_eval")

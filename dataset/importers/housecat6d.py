@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from dataset.bop.layout import read_image
 from dataset.errors import ToolkitError
-from dataset.importers.meshes import read_mesh, widest
 from dataset.importers.mosaics import colour_mosaic
 from dataset.importers.plain_pickle import read_plain_pickle
 from dataset.importers.target import (
@@ -32,6 +31,7 @@ from dataset.importers.target import (
     write_imported,
 )
 from dataset.importers.units import UNITS, Unit, check_distances, check_mesh
+from dataset.meshes import read_mesh, widest
 from dataset.polarimetry import ANGLES_DEG, Raw
 from dataset.session import ObjectRecord
 

@@ -99,8 +99,7 @@ def import_(
 
     Args:
         layout: bop: a scene folder of an export; ppp-net: the folder of an object; housecat6d: the folder of
-            a
-            scene; raw-folder: a folder of PNG, TIFF or npy mosaics.
+            a scene; raw-folder: a folder of PNG, TIFF or npy mosaics.
         folder: the data.
         out: the new session.
         mesh: ppp-net: PLY, OBJ or STL of the object.
@@ -111,9 +110,8 @@ def import_(
         stamps: raw-folder: CSV with a column file and any of camera_time_ns, host_time_ns, exposure_us,
             gain_db.
     """
-    from dataset.bop import import_bop
     from dataset.errors import ToolkitError
-    from dataset.importers import import_housecat6d, import_ppp_net, import_raw_folder
+    from dataset.importers import import_bop, import_housecat6d, import_ppp_net, import_raw_folder
 
     def need(**options: object) -> None:
         for name, value in options.items():

@@ -15,8 +15,9 @@ import pytest
 from numpy.typing import NDArray
 
 from dataset import SE3, Intrinsics, SessionError, ToolkitError
-from dataset.bop import export_bop, import_bop
+from dataset.bop import export_bop
 from dataset.bop.layout import decode_stokes, encode_stokes, read_image
+from dataset.importers import import_bop
 from dataset.session import ObjectRecord, Session, write_object
 from dataset.validate import validate
 

@@ -18,7 +18,8 @@ from playwright.sync_api import Page, expect
 
 from acquisition.web import Address, page_server
 from dataset import SE3, CameraInfo, RawFrame, RobotTrace, SessionError
-from dataset.bop import export_bop, import_bop
+from dataset.bop import export_bop
+from dataset.importers import import_bop
 from dataset.pictures import intensity
 from dataset.session import Session, SessionWriter, write_poses
 from s2p3.cli import main

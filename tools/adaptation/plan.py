@@ -27,9 +27,14 @@ DOLP = "student, DoLP physics (the paper's)"
 STOKES = "student, Stokes physics (ours)"
 """The rows' names; folders and results on disk go by them."""
 
-_ADABN_BATCHES = SelfSupervisionConfig().adapt_batches
+
+def _adapted(settings: SelfSupervisionConfig) -> SelfSupervisionConfig:
+    """AdaBN, also where an object's settings go without it."""
+    return replace(settings, adapt_batches=SelfSupervisionConfig().adapt_batches)
+
+
 TRAINED: dict[str, Change] = {
-    ADABN: lambda settings: replace(settings, steps=0, epochs=0, adapt_batches=_ADABN_BATCHES),
+    ADABN: lambda settings: replace(_adapted(settings), steps=0, epochs=0),
     DISTILLED: lambda settings: replace(
         settings, pose_weight=1.0, mask_weight=0.0, normals_weight=0.0, physics="none"
     ),
@@ -39,7 +44,10 @@ TRAINED: dict[str, Change] = {
 }
 """The rows that start from the pre-trained student, and how each departs from the object's settings."""
 
-ROWS = (BEFORE, TEACHER, ADAPTED_TEACHER, *TRAINED)
+CHANGES = {ADAPTED_TEACHER: _adapted, **TRAINED}
+"""The rows that see captured frames."""
+
+ROWS = (BEFORE, TEACHER, *CHANGES)
 """All rows, in the table's order."""
 
 
@@ -122,8 +130,7 @@ class Study:
         config, path = self.experiment(seed), self.checkpoint(row, seed)
         if row in (TEACHER, BEFORE):
             return path, path.stem, getattr(config, path.stem)
-        change = TRAINED.get(row, lambda settings: settings)
-        return path, "self_supervision", change(config.self_supervision)
+        return path, "self_supervision", CHANGES[row](config.self_supervision)
 
 
 def check_settings(study: Study) -> None:

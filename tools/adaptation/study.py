@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from plan import (
     ANALYTIC_HELD_OUT,
     ANALYTIC_SEED,
     BEFORE,
+    CHANGES,
     DETECTOR_FRAMES,
     DETECTOR_SEED,
     HELD_OUT_SEED,
@@ -41,7 +43,6 @@ from plan import (
     TEST,
     TRACED_HELD_OUT,
     TRACED_SEED,
-    TRAINED,
     VALIDATION,
     Study,
     check_settings,
@@ -136,14 +137,15 @@ def adapt_network(study: Study, row: str, seed: int) -> None:
     with Session.open(study.set(ADAPTED_TO)) as session:
         crops = captured_crops(session, range(len(session)), found_in(study, ADAPTED_TO), config.input)
     teacher, student = study.checkpoint(TEACHER, seed), study.checkpoint(BEFORE, seed)
-    path, settings = study.checkpoint(row, seed), config.self_supervision
+    path, settings = study.checkpoint(row, seed), CHANGES[row](config.self_supervision)
+    config = replace(config, self_supervision=settings)
     if row == ADAPTED_TEACHER:
         network, info = load_teacher(teacher, model.name)
         adapt_batch_norm(network, crops, model.refractive_index, config, settings)
         path.parent.mkdir(parents=True, exist_ok=True)
         save(path, network.state_dict(), CheckpointInfo.of("teacher", "AdaBN", model, 0, config, info.data))
     else:
-        self_supervise(crops, model, teacher, student, path.parent, TRAINED[row](settings))
+        self_supervise(crops, model, teacher, student, path.parent, settings)
 
 
 def judge_network(study: Study, row: str, seed: int, what: str) -> None:
@@ -186,7 +188,7 @@ def run_study(study: Study, workers: int) -> None:
     for seed in study.seeds:
         for jobs, row in ((guides, TEACHER), (guided, BEFORE)):
             jobs.append((study.checkpoint(row, seed), train_network, (study, row, seed)))
-        for row in (ADAPTED_TEACHER, *TRAINED):
+        for row in CHANGES:
             adaptation.append((study.checkpoint(row, seed), adapt_network, (study, row, seed)))
         judged = [(row, study.judged) for row in ROWS]
         judged += [(row, name) for row in (TEACHER, BEFORE) for name in study.held_out()]

@@ -20,9 +20,10 @@ trained on path-traced and analytic images of the [domain](synthesis.md#domains)
 frames they must cope with are of the domain `captured`. It stands in for a recorded sequence, and has one
 advantage over it: exact truth. How far it lies from the other domains is our choice, made while the method
 was tuned: what counts here is the difference between rows, not how high they are. Losses and images share
-one Fresnel model, so real surfaces will be harder. Students adapt to one set of captured frames, the cup's
-settings were tuned on another, and the judge is a third, `captured-test`, which had no part in that. Other
-objects take the cup's settings; where they differ, their file in `tools/adaptation` says why. Boxes and masks
+one Fresnel model, so real surfaces will be harder. Students adapt to one set of captured frames, an object's
+settings (`tools/adaptation/OBJECT.toml`) were chosen on another, `captured-val`, by its first seed, and the
+judge is a third, `captured-test`, which had no part in that. The fork was first judged with the cup's
+settings; what came of that is in [Training](training.md#presets-and-any-field-of-them). Boxes and masks
 are those of one detector, trained on the domain `synthetic`; a target without a detection counts as failed.
 A commit called *dirty* had other lists of rows in the study's script; what trains was the commit's.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.fusion import turned_alike
 from calibration.object_observability import Tip, describe, openness, turns_that_fit
+from calibration.robot_world import adjoint
 from calibration.surface_fit import Surface, coarse_fit, finest_fit
 from calibration.words import axis_name
 from dataset.errors import CalibrationError
@@ -62,6 +63,20 @@ class ObjectPoseResult:
     rivals: tuple[str, ...]
     ambiguity_deg: Floats
     runner_up_rms_m: float
+
+    def turned_towards(self, reference: SE3, turns: SE3) -> ObjectPoseResult:
+        """The same result as the one of its equal poses T_base_obj @ turn that is turned least against a
+        reference; the object looks the same after each of the n `turns`."""
+        among = SE3.stack([SE3.identity(), *turns])
+        angle = np.linalg.norm((reference.inverse() @ self.T_base_obj @ among).as_rotvec(), axis=1)
+        turn = among[int(np.argmin(angle))]
+        into = adjoint(turn.inverse())
+        return replace(
+            self,
+            T_base_obj=self.T_base_obj @ turn,
+            covariance=into @ self.covariance @ into.T,
+            tip_covariance=into @ self.tip_covariance @ into.T,
+        )
 
 
 def register_points(

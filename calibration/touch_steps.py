@@ -93,9 +93,11 @@ def add_object(
     found = [_read(path, calibration, tip) for path in paths]
     results: list[ObjectPoseResult] = []
     for t in found:
-        # From where the first found it: of the poses that an object's symmetry makes equal, the same one.
         init = results[0].T_base_obj if results else None
-        results.append(register_points(t.points, vertices, faces, init, symmetry_axis, t.tip, symmetry_turns))
+        result = register_points(t.points, vertices, faces, init, symmetry_axis, t.tip, symmetry_turns)
+        if init is not None and symmetry_turns is not None:
+            result = result.turned_towards(init, symmetry_turns)
+        results.append(result)
     sources = tuple(Source.of(path) for path in paths)
     record = _fused(results, sources, symmetry_axis)
     _known(calibration).merged(Calibration(objects={name: record})).save(calibration)

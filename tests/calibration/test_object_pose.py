@@ -95,6 +95,29 @@ def test_known_turns_are_no_defect_nor_a_rival():
     assert known.runner_up_rms_m > 2 * known.rms_m
 
 
+def test_a_result_turned_towards_a_reference_is_the_same_object_with_its_uncertainty():
+    bar = trimesh.creation.box([0.06, 0.06, 0.1])
+    quarters = SE3.from_rotvec(np.pi / 2 * np.arange(1, 4)[:, None] * [0, 0, 1.0], np.zeros(3))
+    found = register_points(_touch(bar, 30, 0), bar.vertices, bar.faces, TRUTH, symmetry_turns=quarters)
+    other = found.T_base_obj @ quarters[0]
+    turned = found.turned_towards(other, quarters)
+    np.testing.assert_allclose(turned.T_base_obj.as_matrix(), other.as_matrix(), atol=1e-9)
+    assert found.turned_towards(found.T_base_obj, quarters).T_base_obj.log() == pytest.approx(
+        found.T_base_obj.log()
+    )
+    at = found.T_base_obj.apply([0.02, 0.01, 0.03])
+    spreads = [_spread(result, result.T_base_obj.inverse().apply(at)) for result in (found, turned)]
+    np.testing.assert_allclose(*spreads, rtol=1e-6, atol=1e-15)
+
+
+def _spread(result, point):
+    """Covariance (3, 3) in the base frame of a point (3,) of the object."""
+    x, y, z = point
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    by_pose = result.T_base_obj.rotation @ np.hstack([np.eye(3), -cross])
+    return by_pose @ result.covariance @ by_pose.T
+
+
 def test_a_box_touched_on_two_sides_only_does_not_know_its_height():
     box = trimesh.creation.box([0.06, 0.08, 0.3])
     rng = np.random.default_rng(0)

@@ -89,6 +89,23 @@ def test_tip_then_object_from_recordings(tilted, tmp_path):
     np.testing.assert_allclose(loaded.tool_tip.covariance, record.covariance)
 
 
+def test_sessions_of_a_symmetric_object_are_fused_whichever_copy_each_finds(tmp_path):
+    prism = trimesh.creation.cylinder(radius=0.04, height=0.1, sections=6)
+    turns = SE3.from_rotvec(np.pi / 3 * np.arange(1, 6)[:, None] * [0, 0, 1.0], np.zeros(3))
+    flip = SE3.from_rotvec([np.pi, 0, 0], np.zeros(3))
+    turns = SE3.stack([*turns, flip, *(turn @ flip for turn in turns)])
+    files = []
+    for seed in (1, 3):  # the second is found 60 degrees from the first
+        points = trimesh.sample.sample_surface(prism, 24, seed=seed)[0]
+        points = points + np.random.default_rng(seed).normal(0, 4e-4, points.shape)
+        files.append(tmp_path / f"{seed}.txt")
+        np.savetxt(files[-1], SE3.from_rotvec([0.1, 0.2, 0.3], [0.4, 0.1, 0.1]).apply(points))
+    found = add_object(
+        files, "nut", prism.vertices, prism.faces, tmp_path / "calibration.json", symmetry_turns=turns
+    )
+    assert np.linalg.norm(found.T_base_obj.translation - [0.4, 0.1, 0.1]) < 5e-4
+
+
 def test_a_trace_without_rests_is_swung_about_the_tip_too(tmp_path):
     azimuth = np.linspace(0, 12, 60)
     rotation = down(

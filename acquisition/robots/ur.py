@@ -16,7 +16,7 @@ from acquisition.robot import MotionStopped, Robot, RobotConfig
 from acquisition.robots.limits import MotionLimits, joint_angles
 from acquisition.robots.motion_client import MotionClient
 from acquisition.robots.stream import RtdeStream
-from acquisition.robots.ur_receiver import UrReceiver, check_tool, same_tool
+from acquisition.robots.ur_receiver import UrReceiver, check_tool, check_unchanged
 from dataset.errors import DeviceError
 from dataset.frames import RobotSample
 from dataset.transforms import SE3
@@ -210,12 +210,7 @@ class UrRobot(UrReceiver, Robot):
             self._stream.check()
             self._motion.start()
             active = self._active_tool(self._motion)
-        if not same_tool(active, self._tcp_offset):
-            was, is_now = (np.round(tool, 4).tolist() for tool in (self._tcp_offset, active))
-            raise DeviceError(
-                f"the tool offset of the arm {self.config.host} was changed from {was} to {is_now}; connect "
-                "again, and calibrate with this tool"
-            )
+        check_unchanged(active, self._tcp_offset, self.config.host)
 
 
 def _distance(sample: RobotSample, target: Floats | SE3) -> float:

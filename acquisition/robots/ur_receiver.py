@@ -55,9 +55,11 @@ class UrReceiver(PoseSource):
         return self._stream.payload
 
     def sample(self) -> RobotSample:
-        sample = self._stream.sample()
-        if self._stream.tcp_offset is None:  # then the pose must tell whether the tool is still the same
+        sample, told = self._stream.sample(), self._stream.tcp_offset
+        if told is None:  # then the pose must tell whether the tool is still the same
             check_tool(sample, self._tcp_offset, self.config.host)
+        else:
+            check_unchanged(told, self._tcp_offset, self.config.host)
         return sample
 
     def start_trace(self) -> None:
@@ -105,6 +107,16 @@ def same_tool(one: Floats, other: Floats | tuple[float, ...]) -> bool:
     """Whether two tool offsets (6,) are one; as poses, because rotation vectors are ambiguous."""
     a, b = SE3.from_pose6(one), SE3.from_pose6(np.array(other, dtype=np.float64))
     return bool(np.allclose(a.as_matrix(), b.as_matrix(), rtol=0, atol=_SAME_TOOL))
+
+
+def check_unchanged(active: Floats, tcp_offset: Floats, host: str) -> None:
+    """Raises DeviceError where the active tool is no longer the one that the arm was opened with."""
+    if not same_tool(active, tcp_offset):
+        was, is_now = (np.round(tool, 4).tolist() for tool in (tcp_offset, active))
+        raise DeviceError(
+            f"the tool offset of the arm {host} was changed from {was} to {is_now}; connect again, and "
+            "calibrate with this tool"
+        )
 
 
 def check_tool(sample: RobotSample, tcp_offset: Floats, host: str) -> None:

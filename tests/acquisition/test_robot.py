@@ -223,6 +223,16 @@ class TestToolAndPayload:
         tool = np.linalg.norm(trace.pose[:, :3] - forward(trace.q).translation, axis=1)
         assert np.ptp(tool) < 1e-9
 
+    def test_a_tool_changed_while_nothing_is_recorded_is_noticed(
+        self, arm: SimulatedRobot, robot: UrRobot
+    ) -> None:
+        with UrReceiver(config(arm)) as reader:
+            arm.command("tcp 0 0 0.2 0 0.3 0")
+            time.sleep(0.1)
+            with pytest.raises(DeviceError, match=r"was changed from .* connect again, and calibrate"):
+                reader.sample()
+        arm.command(f"tcp {' '.join(map(str, TCP))}")
+
     def test_a_tool_changed_between_moves_stops_the_next(self, arm: SimulatedRobot, robot: UrRobot) -> None:
         arm.command("tcp 0 0 0.2 0 0.3 0")
         with pytest.raises(DeviceError, match=r"was changed from .* connect again, and calibrate"):

@@ -290,7 +290,7 @@ def _write_poses(target: h5py.File, parts: list[_Part]) -> None:
         return
     for name in ("T_base_cam", "sigma_t", "sigma_r"):
         _put(target, f"poses/{name}", _stacked(parts, f"poses/{name}", np.nan))
-    annotated = dict.fromkeys(name for part in parts for name in part.session.contents.names("poses/objects"))
+    annotated = dict.fromkeys(name for part in parts for name in part.session.annotated)
     for name in annotated:
         root = f"poses/objects/{name}"
         for column, missing in (("T_cam_obj", np.nan), ("visible_fraction", 0.0), ("bbox_xywh", 0.0)):

@@ -103,10 +103,10 @@ def split_session(
     with Session.open(path) as session:
         if by == "frame":
             found = by_frame(len(session), fractions, seed)
-        elif not (annotated := session.contents.names("poses/objects")):
+        elif not session.annotated:
             raise SessionError(f"{path} has no annotated object, so no views; run: s2p3 annotate {path}")
         else:
-            found = by_view(session.object_poses(annotated[0]).T_cam_obj, fractions, seed)
+            found = by_view(session.object_poses(session.annotated[0]).T_cam_obj, fractions, seed)
     for name, indices in found.items():
         write_split(path, name, indices)
     return found

@@ -7,6 +7,7 @@ and the pose at which the object was touched. Masks and boxes are rendered from 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 
 from calibration import Calibration, camera_poses
 from dataset import SE3, CalibrationError, Intrinsics
+from dataset.errors import ToolkitWarning
 from dataset.session import (
     ObjectPoses,
     PackedMasks,
@@ -25,6 +27,7 @@ from dataset.session import (
     write_poses,
 )
 from s2p3.objects import ObjectModel
+from s2p3.rendering.mesh import Mesh
 from s2p3.rendering.rasterizer import projected_region, rasterize
 
 Progress = Callable[[int, int], None]
@@ -42,19 +45,23 @@ class Annotation:
 def annotate(
     path: Path, calibration: Calibration, model: ObjectModel, on_progress: Progress | None = None
 ) -> Annotation:
-    """Writes camera poses, object poses, boxes and masks into a session, replacing earlier ones.
+    """Writes camera poses, object poses, boxes and masks into a session, replacing earlier ones. Objects that
+    were annotated before are annotated again, with this calibration.
 
     Args:
-        path: of a complete session with a robot trace.
-        calibration: with intrinsics, hand-eye and the object's pose; the time offset where the arm was
-            moving.
+        path: of a complete session, with a robot trace unless the camera is fixed.
+        calibration: with intrinsics, hand-eye or a fixed camera, and the object's pose; the time offset where
+            the arm was moving.
         model: the object.
 
     Raises:
         CalibrationError: a part is missing, or the object's pose was not calibrated.
         SessionError: the session cannot be read or edited.
+
+    Warns (ToolkitWarning) of an object annotated before whose pose this calibration does not hold: it loses
+    its annotation.
     """
-    calibration.require("intrinsics", "hand_eye")
+    calibration.require("intrinsics")
     assert calibration.intrinsics is not None
     if model.name not in calibration.objects:
         known = ", ".join(calibration.objects) or "none"
@@ -62,24 +69,36 @@ def annotate(
             f"calibration: no pose of {model.name!r} (objects: {known}); "
             "touch it and run `s2p3 calibrate object` first"
         )
+    with Session.open(path) as session:
+        cameras = camera_poses(session, calibration)
+        names = dict.fromkeys((model.name, *session.annotated))
     write_calibration(
         path, calibration.to_json(), calibration.intrinsics.intrinsics, calibration.polarizer_response
     )
     write_object(path, model.to_record())
+    T_cam_base = cameras.T_base_cam.inverse()
+    poses = {}
     with Session.open(path) as session:
-        cameras = camera_poses(session, calibration)
-        poses = render_poses(
-            session,
-            cameras.T_base_cam.inverse() @ calibration.objects[model.name].T_base_obj,
-            model,
-            on_progress,
-        )
-    write_poses(path, cameras.T_base_cam, cameras.sigma_m, cameras.sigma_rad, {model.name: poses})
-    return Annotation(len(poses.visible_fraction), int((poses.visible_fraction > 0).sum()))
+        for name in names:
+            if name in calibration.objects:
+                record = session.object(name)
+                mesh = Mesh.from_arrays(record.vertices, record.faces)
+                T_cam_obj = T_cam_base @ calibration.objects[name].T_base_obj
+                poses[name] = render_poses(session, T_cam_obj, mesh, on_progress)
+            else:
+                warnings.warn(
+                    f"{path}: {name!r} is no longer annotated, because this calibration does not hold its "
+                    "pose; touch it and run `s2p3 calibrate object`, then annotate it again",
+                    ToolkitWarning,
+                    stacklevel=2,
+                )
+    write_poses(path, cameras.T_base_cam, cameras.sigma_m, cameras.sigma_rad, poses)
+    visible = poses[model.name].visible_fraction
+    return Annotation(len(visible), int((visible > 0).sum()))
 
 
 def render_poses(
-    session: Session, T_cam_obj: SE3, model: ObjectModel, on_progress: Progress | None = None
+    session: Session, T_cam_obj: SE3, mesh: Mesh, on_progress: Progress | None = None
 ) -> ObjectPoses:
     """Masks, boxes and visibility of an object at known poses (N) in a session's undistorted image.
 
@@ -98,7 +117,7 @@ def render_poses(
     for index in range(count):
         if np.isfinite(T_cam_obj.translation[index]).all():
             pose = T_cam_obj[index]
-            raster = rasterize(model.mesh, pose, canvas, projected_region(model.mesh, pose, canvas))
+            raster = rasterize(mesh, pose, canvas, projected_region(mesh, pose, canvas))
             drawn = np.zeros((3 * height, 3 * width), dtype=bool)
             drawn[raster.window] = raster.mask
             mask = drawn[height : 2 * height, width : 2 * width]

@@ -52,7 +52,7 @@ def check_masks(path: str | Path) -> Iterator[Problem]:
         SessionError: the session cannot be read.
     """
     with Session.open(path) as session:
-        for name in session.contents.names("poses/objects"):
+        for name in session.annotated:
             if name in session.objects and session.intrinsics is not None:
                 yield from _check_object(session, name)
 

@@ -104,7 +104,7 @@ def annotate(recording: Path, truth: LabTruth) -> None:
         exposed_s = 1e-9 * session.mid_exposure_host_ns + truth.time_offset_s
         T_base_tcp = interpolate_poses(sampled_s, trace.poses, np.clip(exposed_s, *sampled_s[[0, -1]]))
         T_base_cam = T_base_tcp @ truth.T_tcp_cam
-        poses = render_poses(session, T_base_cam.inverse() @ truth.T_base_object, model)
+        poses = render_poses(session, T_base_cam.inverse() @ truth.T_base_object, model.mesh)
     write_poses(recording, T_base_cam, 0.0, 0.0, {model.name: poses})
 
 

@@ -31,7 +31,8 @@ def write_calibration(
     intrinsics: Intrinsics | None,
     response: PolarizerResponse | None = None,
 ) -> None:
-    """Stores the calibration that was applied, replacing an earlier one.
+    """Stores the calibration that was applied, replacing an earlier one; poses, boxes and masks that were
+    computed with that are removed.
 
     Args:
         path: of a complete session.
@@ -55,8 +56,9 @@ def write_calibration(
                 f"{path}: the polarizer response is for {response.shape[1]}x{response.shape[0]} pixels, the "
                 f"mosaic has {size[1]}x{size[0]}; calibrate the polarizers at the mosaic's resolution"
             )
-        if "calibration" in file:
-            del file["calibration"]
+        for outdated in ("calibration", "poses"):
+            if outdated in file:
+                del file[outdated]
         if intrinsics is not None:
             store_intrinsics(file, intrinsics)
         if response is not None:

@@ -320,6 +320,11 @@ class Session:
         """Names of the objects whose mesh the session holds."""
         return self.contents.names("objects")
 
+    @property
+    def annotated(self) -> tuple[str, ...]:
+        """Names of the objects that have poses."""
+        return self.contents.names("poses/objects")
+
     def object(self, name: str) -> ObjectRecord:
         """An object's mesh and material.
 

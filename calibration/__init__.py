@@ -29,7 +29,7 @@ from calibration.sessions import (
 from calibration.streams import solve_streams
 from calibration.time_offset import TimeOffsetResult, estimate_time_offset
 from calibration.tool_tip import ToolTipResult, calibrate_tool_tip
-from calibration.touches import KnownTip, object_from_touches, tool_tip_from_session
+from calibration.touches import KnownTip, tool_tip_from_session
 
 __all__ = [
     "BoardSpec",
@@ -64,7 +64,6 @@ __all__ = [
     "hand_eye_from_session",
     "intrinsics_from_session",
     "next_pose",
-    "object_from_touches",
     "register_points",
     "solve_robot_world",
     "solve_streams",

@@ -23,11 +23,12 @@ class Applied:
 
 def apply_calibration(session: Path, calibration: Calibration) -> Applied:
     """Writes /calibration (the text with its sha256, K and distortion, the polarizers' response) and, where
-    hand-eye and the arm's trace are known, the camera's pose in every frame. What an earlier calibration left
-    is replaced; objects annotated with it lose their poses: annotate again.
+    they are known, the camera's pose in every frame. What an earlier calibration left is replaced, poses
+    included; objects annotated with it lose theirs: annotate again.
 
     Raises:
-        CalibrationError: nothing in the calibration concerns a camera.
+        CalibrationError: nothing in the calibration concerns a camera; or the session holds poses that no
+            arm gave, as an import or a synthetic set does.
         SessionError: the session cannot be edited, or is of another image size.
     """
     if calibration.intrinsics is None and calibration.polarizer is None:
@@ -37,13 +38,20 @@ def apply_calibration(session: Path, calibration: Calibration) -> Applied:
         )
     intrinsics = None if calibration.intrinsics is None else calibration.intrinsics.intrinsics
     response = calibration.polarizer_response
-    write_calibration(session, calibration.to_json(), intrinsics, response)
     with Session.open(session) as opened:
-        frames = len(opened)
-        has_arm = opened.robot is not None and len(opened.robot) > 1
-        if calibration.hand_eye is None or not has_arm or frames == 0:
-            return Applied(intrinsics is not None, response is not None, 0, frames)
-        cameras = camera_poses(opened, calibration)
-    write_poses(session, cameras.T_base_cam, cameras.sigma_m, cameras.sigma_rad, {})
-    known = int(cameras.T_base_cam.finite.sum())
+        frames, has_arm = len(opened), opened.robot is not None and len(opened.robot) > 1
+        carried = calibration.hand_eye is not None and has_arm
+        cameras = None
+        if frames and (carried or calibration.fixed_camera is not None):
+            cameras = camera_poses(opened, calibration)
+        elif opened.poses is not None and not has_arm:
+            raise CalibrationError(
+                f"{session}: holds poses that no arm's trace gave (imported or synthetic), and they would not"
+                " fit another calibration; apply it to a recording"
+            )
+    write_calibration(session, calibration.to_json(), intrinsics, response)
+    known = 0
+    if cameras is not None:
+        write_poses(session, cameras.T_base_cam, cameras.sigma_m, cameras.sigma_rad, {})
+        known = int(cameras.T_base_cam.finite.sum())
     return Applied(intrinsics is not None, response is not None, known, frames)

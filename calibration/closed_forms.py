@@ -21,9 +21,6 @@ from dataset.transforms import SE3, matrix_to_rotvec
 Mount = Literal["eye_in_hand", "eye_to_hand"]
 """`eye_in_hand`: camera on the tool, board fixed. `eye_to_hand`: camera fixed, board on the tool."""
 
-MOUNTED_ON: dict[Mount, str] = {"eye_in_hand": "tool", "eye_to_hand": "base"}
-"""What carries the camera."""
-
 _HAND_EYE = {
     "tsai": cv2.CALIB_HAND_EYE_TSAI,
     "park": cv2.CALIB_HAND_EYE_PARK,

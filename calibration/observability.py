@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.closed_forms import Mount
+from calibration.words import axis_name
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3
 
@@ -91,11 +92,11 @@ def require_observable(T_base_tcp: SE3, mount: Mount = "eye_in_hand") -> Rotatio
     if spread.rms_deg[1] < MIN_SPREAD_DEG:
         first, second = spread.axes[0], spread.axes[1]
         raise CalibrationError(
-            f"hand-eye: the tool rotated about one axis only ({_name_axis(first)}, {spread.rms_deg[0]:.1f}"
+            f"hand-eye: the tool rotated about one axis only ({axis_name(first)}, {spread.rms_deg[0]:.1f}"
             " degrees rms;"
-            f" {spread.rms_deg[1]:.2f} about {_name_axis(second)}), so the {carried}'s position along that"
+            f" {spread.rms_deg[1]:.2f} about {axis_name(second)}), so the {carried}'s position along that"
             " axis is not"
-            f" observable; add views tilted by 15-30 degrees about {_name_axis(second)} of the tool"
+            f" observable; add views tilted by 15-30 degrees about {axis_name(second)} of the tool"
         )
     return spread
 
@@ -108,12 +109,3 @@ def _distinct_poses(poses: SE3) -> int:
         if not (near & (np.linalg.norm(moved.as_rotvec(), axis=1) < _SAME_RAD)).any():
             kept.append(index)
     return len(kept)
-
-
-def _name_axis(axis: NDArray[np.float64]) -> str:
-    """'x', 'y' or 'z' when it is nearly one of them, the vector otherwise."""
-    largest = int(np.argmax(np.abs(axis)))
-    if abs(axis[largest]) > np.cos(np.radians(10.0)):
-        return "xyz"[largest]
-    axis = axis * np.sign(axis[largest])
-    return f"[{axis[0]:.2f} {axis[1]:.2f} {axis[2]:.2f}]"

@@ -79,10 +79,14 @@ class IntrinsicsRecord:
         )
 
 
+def _known(tcp_offset: Floats | None) -> Floats:
+    return np.zeros(0) if tcp_offset is None else tcp_offset
+
+
 @dataclass(frozen=True, eq=False)
 class HandEyeRecord:
     """The camera on the tool, the board in the base; covariance (12, 12) of both twists; the arm's noise;
-    what is odd, in words."""
+    what is odd, in words; the arm's tool setting (6,) that T_tcp_cam holds for, empty where unknown."""
 
     T_tcp_cam: SE3
     T_base_board: SE3
@@ -95,10 +99,22 @@ class HandEyeRecord:
     views: int
     sources: tuple[Source, ...]
     warnings: tuple[str, ...] = ()
+    tcp_offset: Floats = field(default_factory=lambda: np.zeros(0))
+
+    def camera_on(self, tcp_offset: Floats | None) -> SE3:
+        """T_tcp_cam where the arm's tool setting is another (6,): the flange carries the camera, so the frame
+        changes, not the camera's place. As calibrated where either setting is unknown."""
+        if tcp_offset is None or len(self.tcp_offset) == 0:
+            return self.T_tcp_cam
+        T_flange_cam = SE3.from_pose6(self.tcp_offset) @ self.T_tcp_cam
+        return SE3.from_pose6(tcp_offset).inverse() @ T_flange_cam
 
     @staticmethod
     def of(
-        result: HandEyeResult, sources: tuple[Source, ...], warnings: tuple[str, ...] = ()
+        result: HandEyeResult,
+        tcp_offset: Floats | None,
+        sources: tuple[Source, ...],
+        warnings: tuple[str, ...] = (),
     ) -> HandEyeRecord:
         """The part of a result that is kept."""
         return HandEyeRecord(
@@ -113,6 +129,7 @@ class HandEyeRecord:
             int(result.used.sum()),
             sources,
             warnings,
+            _known(tcp_offset),
         )
 
 
@@ -193,7 +210,7 @@ class ToolTipRecord:
             result.rms_m,
             int(result.used.sum()),
             int((~result.used).sum()),
-            np.zeros(0) if tcp_offset is None else tcp_offset,
+            _known(tcp_offset),
             sources,
         )
 

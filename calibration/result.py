@@ -198,7 +198,7 @@ def _decode(kind: type[T], content: Any, where: str) -> T:
             continue  # written by a version that did not know it yet
         try:
             values[f.name] = _decode_value(hints[f.name], content[f.name], at)
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise CalibrationError(f"{at} is missing or malformed; run the calibration again") from error
     return kind(**values)
 

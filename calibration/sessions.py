@@ -13,7 +13,7 @@ from calibration.closed_forms import Mount, mean_pose
 from calibration.detection import Detection, detect_in_mosaic, explain_missing_board, intensity_image
 from calibration.hand_eye import HandEyeResult, calibrate_hand_eye
 from calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
-from calibration.records import HandEyeRecord, IntrinsicsRecord
+from calibration.records import FixedCameraRecord, HandEyeRecord, IntrinsicsRecord
 from calibration.result import Calibration
 from calibration.time_offset import TimeOffsetResult, estimate_time_offset
 from dataset.errors import CalibrationError
@@ -161,7 +161,7 @@ def time_offset_from_session(
         [d for _, d in detections],
         spec,
         intrinsics.intrinsics,
-        hand_eye.T_tcp_cam,
+        hand_eye.camera_on(session.tcp_offset),
         hand_eye.T_base_board,
         hand_eye.covariance,
     )
@@ -226,7 +226,7 @@ class CameraPoses:
 
 def camera_poses(session: Session, calibration: Calibration) -> CameraPoses:
     """Where the camera was in every frame: the arm's trace at mid exposure plus the time offset, times
-    T_tcp_cam.
+    T_tcp_cam; or, of a fixed camera, where it stands.
 
     The uncertainty adds those of the hand-eye transform, of the arm, and, times the speed, those of the time
     offset and of both clocks. Where samples of the arm are missing around an exposure, its pose is unknown.
@@ -234,9 +234,12 @@ def camera_poses(session: Session, calibration: Calibration) -> CameraPoses:
     Raises:
         CalibrationError: the hand-eye transform is missing, or there is no robot trace.
     """
+    if calibration.fixed_camera is not None:
+        return _standing(calibration.fixed_camera, len(session))
     calibration.require("hand_eye")
     hand_eye = calibration.hand_eye
     assert hand_eye is not None
+    T_tcp_cam = hand_eye.camera_on(session.tcp_offset)
     offset = calibration.time_offset
     offset_s, offset_sigma_s = (0.0, 0.0) if offset is None else (offset.offset_s, offset.sigma_s)
     times_ns, trace = arm_trace(session)
@@ -244,10 +247,10 @@ def camera_poses(session: Session, calibration: Calibration) -> CameraPoses:
     times = np.asarray((times_ns - origin) * 1e-9, np.float64)
     at = np.asarray((session.mid_exposure_host_ns - origin) * 1e-9 + offset_s, np.float64)
     known = (at >= times[0]) & (at <= times[-1]) & (_hole_around(times, at) < _longest_hole_s(times))
-    T_base_cam = interpolate_poses(times, trace, np.clip(at, times[0], times[-1])) @ hand_eye.T_tcp_cam
+    T_base_cam = interpolate_poses(times, trace, np.clip(at, times[0], times[-1])) @ T_tcp_cam
     before = interpolate_poses(times, trace, np.clip(at - _SLOPE_SPAN_S, times[0], times[-1]))
     after = interpolate_poses(times, trace, np.clip(at + _SLOPE_SPAN_S, times[0], times[-1]))
-    moved = (before @ hand_eye.T_tcp_cam).inverse() @ (after @ hand_eye.T_tcp_cam)
+    moved = (before @ T_tcp_cam).inverse() @ (after @ T_tcp_cam)
     speed = np.linalg.norm(moved.translation, axis=1) / (2 * _SLOPE_SPAN_S)
     turning = np.linalg.norm(moved.as_rotvec(), axis=1) / (2 * _SLOPE_SPAN_S)
     time_variance = offset_sigma_s**2 + session.time_sigma_s**2
@@ -260,6 +263,16 @@ def camera_poses(session: Session, calibration: Calibration) -> CameraPoses:
         np.sqrt(variance_m + speed**2 * time_variance),
         np.sqrt(variance_rad + turning**2 * time_variance),
     )
+
+
+def _standing(camera: FixedCameraRecord, frames: int) -> CameraPoses:
+    """The same pose in all frames."""
+    ones = np.ones(frames)
+    T_base_cam = SE3.stack([camera.T_base_cam] * frames) if frames else SE3.identity((0,))
+    sigma_m, sigma_rad = (
+        np.sqrt(np.trace(camera.covariance[part, part])) for part in (slice(3), slice(3, 6))
+    )
+    return CameraPoses(T_base_cam, sigma_m * ones, sigma_rad * ones)
 
 
 def _hole_around(times_s: Floats, at_s: Floats) -> Floats:

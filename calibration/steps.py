@@ -92,7 +92,7 @@ def add_hand_eye(
     reachable: Reachable | None = None,
 ) -> HandEyeStep:
     """Estimates T_tcp_cam and T_base_board from stills of the board; of a fixed camera (eye to hand),
-    T_base_cam and T_tcp_board.
+    T_base_cam and T_tcp_board. Either takes the place of both: there is one camera.
 
     Args:
         session: stills of the board, the arm at rest.
@@ -121,14 +121,15 @@ def add_hand_eye(
         views, _ = views_at_rest(opened, found)  # the result counts these, not all that show the board
         views = [views[i] for i in select_views([d for _, d in views], spec)]
         result = hand_eye_from_session(opened, spec, prior, views, mount, refine_camera)
-        pictures = _pictures(opened, views)
+        pictures, tcp_offset = _pictures(opened, views), opened.tcp_offset
     frames = [index for index, _ in views]
     warnings = remarks.of_hand_eye(result, frames)
     refined = _refined(known.intrinsics, result, source)
     changed = Calibration(board=spec, intrinsics=refined)
+    known = replace(known, hand_eye=None, fixed_camera=None)
     record: HandEyeRecord | FixedCameraRecord
     if mount == "eye_in_hand":
-        record = HandEyeRecord.of(result, (source,), warnings)
+        record = HandEyeRecord.of(result, tcp_offset, (source,), warnings)
         known.merged(replace(changed, hand_eye=record)).save(calibration)
     else:
         record = FixedCameraRecord.of(result, (source,), warnings)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.object_observability import Tip
-from calibration.object_pose import ObjectPoseResult, register_points
 from calibration.sessions import arm_trace, rest_pose
 from calibration.tool_tip import MIN_POSES, ToolTipResult, calibrate_tool_tip
 from dataset.errors import CalibrationError
@@ -51,31 +50,6 @@ class Touches:
 
     points: Floats
     tip: Tip
-
-
-def object_from_touches(
-    touches: Session | str | Path,
-    vertices: ArrayLike,
-    faces: ArrayLike,
-    tip: KnownTip,
-    init: SE3 | None = None,
-    symmetry_axis: ArrayLike | None = None,
-) -> ObjectPoseResult:
-    """The pose of an object in the base frame from touched points.
-
-    Args:
-        touches, tip: as in `touched_points` or `points_of_file`.
-        vertices, faces: (V, 3) metres, (F, 3): the object.
-        init, symmetry_axis: as in `register_points`.
-
-    Raises:
-        CalibrationError: as `register_points`, or no readable points.
-    """
-    if isinstance(touches, Session):
-        found = touched_points(touches, tip)
-    else:
-        found = Touches(read_points(touches), Tip(tip.ball_m))
-    return register_points(found.points, vertices, faces, init, symmetry_axis, found.tip)
 
 
 def touched_points(session: Session, tip: KnownTip) -> Touches:

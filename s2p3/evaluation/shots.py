@@ -5,7 +5,7 @@ No pose, mask or box of a session is read, only images, intrinsics and the camer
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,24 +78,35 @@ def folder_shots(folder: Path, mosaic: Mosaic, bits: int | None, calibration: Ca
 def live_shots(rig: Rig, calibration: Calibration, count: int | None) -> Iterator[Shot]:
     """The rig's camera, triggered frame by frame, until `count` or for ever; the arm is only read.
 
-    The camera's place is the arm's after the exposure, so it holds while the arm stands.
+    The camera's place is the arm's after the exposure, so it holds while the arm stands; a fixed camera's is
+    known without the arm.
 
-    Raises ToolkitError: a device does not answer; the calibration is of another image size.
+    Raises ToolkitError: a device does not answer; the arm's tool setting is changed meanwhile; the
+        calibration is of another image size.
     """
     with ExitStack() as stack:
         camera = stack.enter_context(open_camera(rig))
-        arm = None if calibration.hand_eye is None else stack.enter_context(open_pose_source(rig))
+        place_now = _live_place(rig, calibration, stack)
         decoder = _Decoder(camera.info, calibration, "the camera")
         camera.start("software")
         taken = 0
         while count is None or taken < count:
             camera.trigger()
             frame = camera.read()
-            place = None
-            if arm is not None and calibration.hand_eye is not None:
-                place = arm.sample().T_base_tcp @ calibration.hand_eye.T_tcp_cam
-            yield decoder.shot(str(frame.frame_id), frame.pixels, place, frame.host_time_ns)
+            yield decoder.shot(str(frame.frame_id), frame.pixels, place_now(), frame.host_time_ns)
             taken += 1
+
+
+def _live_place(rig: Rig, calibration: Calibration, stack: ExitStack) -> Callable[[], SE3 | None]:
+    """Tells T_base_cam of now; opens the arm on `stack` where it is needed for that."""
+    fixed, hand_eye = calibration.fixed_camera, calibration.hand_eye
+    if fixed is not None:
+        return lambda: fixed.T_base_cam
+    if hand_eye is None:
+        return lambda: None
+    arm = stack.enter_context(open_pose_source(rig))
+    T_tcp_cam = hand_eye.camera_on(arm.tcp_offset)
+    return lambda: arm.sample().T_base_tcp @ T_tcp_cam
 
 
 class _Decoder:

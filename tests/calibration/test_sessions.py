@@ -78,7 +78,7 @@ def test_camera_poses_carry_their_uncertainty(world, stills, calibrated):
     _, intrinsics, hand_eye = calibrated
     calibration = Calibration(
         intrinsics=intrinsics,
-        hand_eye=HandEyeRecord.of(hand_eye, ()),
+        hand_eye=HandEyeRecord.of(hand_eye, None, ()),
         time_offset=TimeOffsetRecord(-0.06, 1e-4, 0.2, ()),
     )
     with Session.open(path) as session:

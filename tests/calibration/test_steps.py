@@ -101,6 +101,20 @@ def test_another_board_than_hand_eyes_is_refused_for_the_clocks(
         add_time_offset(stills[0], replace(world.spec, square_m=0.031), calibration)
 
 
+def test_either_place_of_the_camera_takes_the_place_of_the_other(
+    world, stills, known: Path, tmp_path: Path
+) -> None:
+    calibration = copied(known, tmp_path)
+    still = FixedCameraRecord(SE3.identity(), SE3.identity(), np.eye(12), 0.1, 0.1, 0.01, 1e-5, 1e-5, 20, ())
+    Calibration.load(calibration).merged(Calibration(fixed_camera=still)).save(calibration)
+    add_hand_eye(stills[0], world.spec, calibration)
+    found = Calibration.load(calibration)
+    assert found.fixed_camera is None
+    assert found.hand_eye is not None
+    with Session.open(stills[0]) as session:
+        np.testing.assert_array_equal(found.hand_eye.tcp_offset, session.tcp_offset)
+
+
 def test_a_trace_with_nan_is_refused(stills, tmp_path: Path) -> None:
     path = Path(shutil.copy(stills[0], tmp_path / "nan.h5"))
     with h5py.File(path, "r+") as file:

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibration import Calibration, HandEyeRecord, IntrinsicsRecord, ObjectPoseRecord, TimeOffsetRecord
+from calibration import (
+    Calibration,
+    HandEyeRecord,
+    IntrinsicsRecord,
+    ObjectPoseRecord,
+    TimeOffsetRecord,
+    apply_calibration,
+)
+from calibration.records import FixedCameraRecord
 from dataset import SE3, CameraInfo, ClockFit, Intrinsics, RawFrame, RobotTrace
-from dataset.errors import CalibrationError
+from dataset.errors import CalibrationError, ToolkitWarning
 from dataset.session import Session, SessionWriter
 from dataset.transforms import rotation_error_deg, translation_error_mm
 from dataset.validate import validate
+from s2p3 import objects
 from s2p3.annotation import annotate
 from s2p3.cli import main
 from s2p3.objects import ObjectModel
@@ -117,6 +127,86 @@ def drawn(cup: ObjectModel, T_cam_obj: SE3, camera: Intrinsics) -> np.ndarray:
     mask = np.zeros((camera.height, camera.width), bool)
     mask[raster.window] = raster.mask
     return mask
+
+
+def test_a_second_object_leaves_the_first_where_it_is(recorded: Path, cup: ObjectModel) -> None:
+    fork = objects.build("fork")
+    beside = SE3.from_rotvec(np.zeros(3), [0.05, 0.0, 0.0]) @ T_BASE_CUP
+    both = calibration(cup).merged(
+        Calibration(objects={"fork": replace(calibration(cup).objects["cup"], T_base_obj=beside)})
+    )
+    annotate(recorded, calibration(cup), cup)
+    with Session.open(recorded) as session:
+        before = session.object_poses("cup")
+    annotate(recorded, both, fork)
+    assert validate(recorded) == []
+    with Session.open(recorded) as session:
+        assert session.annotated == ("cup", "fork")
+        after = session.object_poses("cup")
+        np.testing.assert_array_equal(after.T_cam_obj.as_matrix(), before.T_cam_obj.as_matrix())
+        np.testing.assert_array_equal(after.bbox_xywh, before.bbox_xywh)
+    with pytest.warns(ToolkitWarning, match="'fork' is no longer annotated"):
+        annotate(recorded, calibration(cup), cup)
+    with Session.open(recorded) as session:
+        assert session.annotated == ("cup",)
+
+
+def test_the_arms_tool_setting_moves_the_frame_not_the_camera(recorded: Path, cup: ObjectModel) -> None:
+    longer = np.array([0.0, 0.01, 0.12, 0.0, 0.2, 0.0])  # the session's is zero
+    known = calibration(cup)
+    assert known.hand_eye is not None
+    T_tcp_cam = SE3.from_pose6(longer).inverse() @ T_TCP_CAM
+    with_gripper = replace(known.hand_eye, T_tcp_cam=T_tcp_cam, tcp_offset=longer)
+    annotate(recorded, replace(known, hand_eye=with_gripper), cup)
+    with Session.open(recorded) as session:
+        assert session.poses is not None
+        assert translation_error_mm(session.poses, camera_at(exposures())).max() < 0.01
+
+
+def test_a_fixed_camera_needs_no_arm(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
+    path = Path(shutil.copy(cup_session, tmp_path / "still.h5"))
+    with Session.open(path) as session:
+        lens, T_cam_obj = session.intrinsics, session.object_poses("cup").T_cam_obj[0]
+    assert lens is not None
+    stands = FixedCameraRecord(
+        T_BASE_CUP @ T_cam_obj.inverse(),
+        SE3.identity(),
+        1e-10 * np.eye(12),
+        0.1,
+        0.1,
+        0.01,
+        1e-5,
+        1e-5,
+        20,
+        (),
+    )
+    known = replace(calibration(cup), hand_eye=None, time_offset=None, fixed_camera=stands)
+    assert known.intrinsics is not None
+    known = replace(known, intrinsics=replace(known.intrinsics, intrinsics=lens))
+    done = annotate(path, known, cup)
+    assert done.visible == done.frames
+    with Session.open(path) as session:
+        found = session.object_poses("cup").T_cam_obj
+        np.testing.assert_allclose(found.as_matrix(), [T_cam_obj.as_matrix()] * done.frames, atol=1e-12)
+
+
+def test_what_another_calibration_had_placed_goes_with_it(recorded: Path, cup: ObjectModel) -> None:
+    annotate(recorded, calibration(cup), cup)
+    done = apply_calibration(recorded, replace(calibration(cup), hand_eye=None, time_offset=None))
+    assert done.poses == 0
+    with Session.open(recorded) as session:
+        assert session.poses is None
+        assert session.annotated == ()
+
+
+def test_poses_that_no_arm_gave_are_not_thrown_away(
+    cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    path = Path(shutil.copy(cup_session, tmp_path / "imported.h5"))
+    before = path.read_bytes()
+    with pytest.raises(CalibrationError, match="no arm's trace gave"):
+        apply_calibration(path, calibration(cup))
+    assert path.read_bytes() == before
 
 
 def test_without_the_time_offset_the_poses_lag(recorded: Path, cup: ObjectModel) -> None:

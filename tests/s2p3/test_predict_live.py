@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from acquisition.rig import CameraTable, Rig, RobotTable
 from acquisition.simulation.camera import SimulatedCamera
 from calibration import Calibration, IntrinsicsRecord
-from dataset import Intrinsics
+from calibration.records import FixedCameraRecord
+from dataset import SE3, Intrinsics
 from dataset.errors import ToolkitError
 from s2p3.evaluation.shots import live_shots
 
@@ -31,5 +34,9 @@ def test_a_live_camera_gives_as_many_shots_as_asked_for(simulated_camera: Simula
         assert shot.stokes[0].max() > 0
         assert shot.T_base_cam is None
         assert shot.host_time_ns > 0
+    still = SE3.from_rotvec([0.1, 0.2, 0.3], [0.4, 0.5, 0.6])
+    stands = FixedCameraRecord(still, still, np.eye(12), 0.1, 0.1, 0.01, 1e-5, 1e-5, 20, ())
+    (shot,) = live_shots(rig, replace(calibration(192, 256), fixed_camera=stands), 1)  # there is no arm
+    assert shot.T_base_cam is still
     with pytest.raises(ToolkitError, match="the calibration is of 512x384; calibrate this camera"):
         next(live_shots(rig, calibration(384, 512), 1))

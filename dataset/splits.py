@@ -99,7 +99,8 @@ def split_session(
         ToolkitError: as `by_frame` and `by_view`.
         SessionError: the session cannot be read or edited, or lacks the poses that views need.
     """
-    fractions = {"train": train, "val": val, "test": 1.0 - train - val}
+    test = round(1.0 - train - val, 9)  # 1 - 0.8 - 0.2 is not zero in floating point
+    fractions = {"train": train, "val": val, "test": test}
     with Session.open(path) as session:
         if by == "frame":
             found = by_frame(len(session), fractions, seed)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from dataset import SE3, ToolkitError
-from dataset.splits import by_frame, by_view
+from dataset.session import Session
+from dataset.splits import by_frame, by_view, split_session
 
 FRACTIONS = {"train": 0.7, "val": 0.1, "test": 0.2}
 
@@ -41,6 +44,14 @@ def test_what_is_no_division_is_refused(fractions: dict[str, float], seed: int) 
         by_frame(100, fractions, seed)
     with pytest.raises(ToolkitError, match="negative"):
         by_view(hemisphere(50), fractions, seed)
+
+
+@pytest.mark.parametrize(("train", "val"), [(0.8, 0.2), (0.9, 0.1), (0.7, 0.3)])
+def test_nothing_is_left_for_a_test_set(recorded: Path, train: float, val: float) -> None:
+    found = split_session(recorded, "frame", train, val, 0)
+    assert len(found["test"]) == 0
+    with Session.open(recorded) as session:
+        assert len(session.splits["train"]) + len(session.splits["val"]) == len(session)
 
 
 def test_a_seed_names_a_split() -> None:

@@ -88,7 +88,7 @@ def page_server(address: Address, title: str) -> Iterator[viser.ViserServer]:
 
     try:
         socket.getaddrinfo(address.host, address.port)  # viser would go on asking for ever
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         raise ToolkitError(f"--host {address.host} is no address; give one of this computer") from error
 
     class Server(viser.ViserServer):

@@ -74,7 +74,7 @@ def _read(address: str, register: int) -> tuple[str, int]:
     """The camera's IPv4 address, and what its register holds."""
     try:
         ip = socket.getaddrinfo(address, PORT, socket.AF_INET, socket.SOCK_DGRAM)[0][4][0]
-    except OSError as error:
+    except (OSError, UnicodeError) as error:  # the latter of "192.168.0..20"
         raise DeviceError(
             f"the camera's address '{address}' is neither an IPv4 address nor a known host name; correct "
             "`address` under [camera] in the rig file"

@@ -113,7 +113,7 @@ class RtdeReader:
         self._data: list[bytes] = []
         try:
             self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of "192.168.0..20"
             raise DeviceError(
                 f"no arm answers at {host}:{PORT} ({error}); check that the controller is on, its address in "
                 "the rig file, the network cable, and that RTDE is enabled (Settings > Security > Services)"

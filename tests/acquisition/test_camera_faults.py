@@ -24,6 +24,7 @@ SMALL = {"width": 256, "height": 192, "frame_rate": 50, "latency_s": 0.002}
     [
         ("127.0.0.1", "answers, but no camera listens there"),
         ("nowhere.invalid", "neither an IPv4 address nor a known host name"),
+        ("192.168.10..20", "neither an IPv4 address nor a known host name"),
     ],
 )
 def test_no_camera_at_the_address(address: str, match: str) -> None:

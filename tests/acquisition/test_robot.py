@@ -262,6 +262,8 @@ class TestConnecting:
     def test_nobody_there(self) -> None:
         with pytest.raises(DeviceError, match=r"no arm answers at 127\.0\.0\.99:30004 .*check"):
             UrRobot(RobotConfig("127.0.0.99"))
+        with pytest.raises(DeviceError, match=r"no arm answers at 127\.0\.\.99"):
+            UrRobot(RobotConfig("127.0..99"))
 
     def test_somebody_who_is_no_controller(self) -> None:
         with socket.create_server(("127.0.0.27", 30004)) as server:

@@ -190,6 +190,7 @@ def test_what_cannot_be_shown_costs_one_line(
         (["dataset", "view", "s.h5", "--token", "easy"], "16 characters"),
         (["dataset", "view", "s.h5", "--every", "0"], "--every 0 is too small"),
         (["dataset", "view", str(GOLDEN), "--host", "no where", "--token", "a" * 16], "is no address"),
+        (["dataset", "view", str(GOLDEN), "--host", "192.168..1", "--token", "a" * 16], "is no address"),
     ],
 )
 def test_a_page_that_cannot_be_served_costs_one_line(

@@ -20,6 +20,7 @@ def clock_warnings(clocks: Clocks, *, moving: bool) -> Iterator[str]:
         clocks: as fitted at its end.
         moving: whether the arm moved while frames were exposed; at rest a late clock does no harm.
     """
+    yield from clocks.problems
     for name, clock in (("camera", clocks.camera), ("arm", clocks.robot)):
         if clock is not None:
             yield from _warnings(name, clock, moving)

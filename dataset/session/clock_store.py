@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 import h5py
 import numpy as np
 from numpy.typing import NDArray
@@ -22,19 +20,29 @@ Times = NDArray[np.int64]
 def fit_stored(file: h5py.File) -> Clocks:
     """Fits both clocks to all arrivals in an open file, segment by segment, and stores them there.
 
-    A clock that no line describes stays as it was, and is None in what is returned. Where the camera has no
-    clock of its own its times are arrivals, each as late as it happened to be.
+    A clock that no line describes stays as it was, and is None in what is returned, which says why. Where
+    the camera has no clock of its own its times are arrivals, each as late as it happened to be.
     """
-    found = {}
+    found: dict[str, DeviceClock] = {}
+    problems = []
     for name, first in (("camera", "first_frame"), ("robot", "first_sample")):
         device, host = _arrivals(file, name)
         starts = [int(row) for row in file["segments"][first]] if "segments" in file else [0]
-        with suppress(ToolkitError):
+        if len(device) == 0:
+            continue
+        try:
             found[name] = fit_clock(device, host, starts)
-            if name == "camera" and file["camera"].attrs.get("clock") == "host":
-                found[name] = DeviceClock((0,), (ClockFit(0.0, 1.0, ARRIVAL_SIGMA_NS),))
-            store(file, name, found[name])
-    return Clocks(found.get("camera"), found.get("robot"))
+        except ToolkitError as error:
+            problems.append(f"the {name}'s clock is not known: {error}")
+            continue
+        if name == "camera" and file["camera"].attrs.get("clock") == "host":
+            found[name] = DeviceClock((0,), (ClockFit(0.0, 1.0, ARRIVAL_SIGMA_NS),))
+        store(file, name, found[name])
+    if not np.isfinite(file["camera/exposure_us"][:]).all():
+        problems.append(
+            "the camera does not tell how long it exposes: the middle of an exposure is not known"
+        )
+    return Clocks(found.get("camera"), found.get("robot"), tuple(problems))
 
 
 def store(file: h5py.File, name: str, clock: DeviceClock) -> None:

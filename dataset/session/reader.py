@@ -236,13 +236,18 @@ class Session:
         """(N,) int64: the middle of each exposure on the host clock, by the camera's clock fit.
 
         Raises:
-            SessionError: the camera's clock was not fitted.
+            SessionError: the camera's clock was not fitted, or it did not tell how long it exposed.
         """
         fit = self.clocks.camera
         if fit is None:
             raise SessionError(
                 f"{self.path}: the camera's clock was not related to the host's, so exposures have no host "
-                "time; record the session again, for at least a few seconds"
+                "time; record the session again, and mind what `s2p3 capture` says of the clocks"
+            )
+        if not np.isfinite(self.exposures_us).all():
+            raise SessionError(
+                f"{self.path}: the camera did not tell how long it exposed, so the middle of an exposure is "
+                "not known; record with a camera that has ExposureTime, or import with a column exposure_us"
             )
         half = np.rint(500.0 * self.exposures_us).astype(np.int64)
         return fit.to_host(self.camera_time_ns + half)

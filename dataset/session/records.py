@@ -101,10 +101,12 @@ class ObjectPoses:
 
 @dataclass(frozen=True)
 class Clocks:
-    """The devices' clocks on the host's; None where not fitted."""
+    """The devices' clocks on the host's, None where not fitted; of a recording just made, why times are not
+    known, a line each."""
 
     camera: DeviceClock | None
     robot: DeviceClock | None
+    problems: tuple[str, ...] = ()
 
 
 def mask_box(mask: NDArray[np.generic]) -> NDArray[np.float64]:

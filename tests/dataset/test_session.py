@@ -161,6 +161,32 @@ def test_undistortion_puts_the_image_where_the_pinhole_projects(tmp_path: Path, 
     np.testing.assert_allclose(centroid, expected, atol=0.3)
 
 
+def test_why_a_time_is_not_known_is_said(
+    tmp_path: Path, camera: CameraInfo, make_frame: Callable[..., RawFrame]
+) -> None:
+    path = tmp_path / "unknown.h5"
+    with SessionWriter(path, "sequence", camera) as writer:
+        for index in range(60):
+            frame = make_frame(index)
+            writer.add_frame(replace(frame, exposure_us=np.nan))
+        assert writer.fit_clocks().problems == (
+            "the camera does not tell how long it exposes: the middle of an exposure is not known",
+        )
+    with (
+        Session.open(path) as session,
+        pytest.raises(SessionError, match="did not tell how long it exposed"),
+    ):
+        _ = session.mid_exposure_host_ns
+    with SessionWriter(tmp_path / "microseconds.h5", "sequence", camera) as writer:
+        for index in range(60):
+            frame = make_frame(index)
+            writer.add_frame(replace(frame, camera_time_ns=frame.camera_time_ns // 1000))
+        clocks = writer.fit_clocks()
+    assert clocks.camera is None
+    (problem,) = clocks.problems
+    assert "not in nanoseconds" in problem
+
+
 def test_what_was_not_recorded_is_none_or_a_clear_error(
     tmp_path: Path, camera: CameraInfo, make_frame: Callable[..., RawFrame]
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataset.errors import ToolkitError
-from dataset.frames import Mosaic
+from dataset.frames import CameraInfo, Mosaic
 from dataset.importers.target import Imported, Stamps, sensor, write_imported
 from dataset.polarimetry import Raw, white_level
 
@@ -45,34 +46,72 @@ def import_raw_folder(
         SessionError: the session exists.
     """
     folder = Path(folder)
-    files = mosaic_files(folder)
-    first = read_mosaic(files[0])
-    if bits is None and first.dtype == np.uint16:
-        raise ToolkitError(f"{files[0]} has 16 bits, of which 10, 12 or all may count; give --bits")
-    depth = bits or 8
-    if not 1 <= depth <= 8 * first.dtype.itemsize:
-        raise ToolkitError(f"--bits {depth} does not fit {files[0]}, which holds {first.dtype}")
-
-    def mosaics() -> Iterator[Raw]:
-        for path in files:
-            pixels = read_mosaic(path)
-            if pixels.shape != first.shape or pixels.dtype != first.dtype:
-                raise ToolkitError(
-                    f"{path} is {pixels.shape} {pixels.dtype}, {files[0].name} is {first.shape} "
-                    f"{first.dtype}; import them separately"
-                )
-            if int(pixels.max()) > white_level(depth):
-                raise ToolkitError(f"{path} holds the value {pixels.max()}, more than --bits {depth} allow")
-            yield pixels
-
+    mosaics = RawMosaics.of(folder, layout, bits)
+    names = [path.name for path in mosaics.files]
     imported = Imported(
-        camera=sensor(layout, first.shape[0], first.shape[1], depth),
+        camera=mosaics.camera,
         intrinsics=None,
-        frame_ids=np.arange(len(files)),
+        frame_ids=np.arange(len(names)),
         origin=f"raw mosaics of the folder {folder.resolve().name}",
-        stamps=None if stamps is None else _stamps(Path(stamps), [path.name for path in files]),
+        stamps=None if stamps is None else _stamps(Path(stamps), names),
     )
-    return write_imported(out, imported, mosaics())
+    return write_imported(out, imported, mosaics)
+
+
+@dataclass(frozen=True)
+class RawMosaics:
+    """The mosaics in the files of a folder, all of one camera; iterating reads and checks one after another.
+
+    Attributes:
+        files: by name.
+        camera: what the files and their owner say of it.
+        dtype: of every file's pixels.
+    """
+
+    files: tuple[Path, ...]
+    camera: CameraInfo
+    dtype: np.dtype[Any]
+
+    @staticmethod
+    def of(folder: Path, layout: Mosaic, bits: int | None) -> RawMosaics:
+        """Of a folder's PNG, TIFF and npy files; arguments as those of `import_raw_folder`.
+
+        Raises:
+            ToolkitError: no such files, the first is no mosaic, or ambiguous or wrong bits.
+        """
+        files = mosaic_files(folder)
+        first = read_mosaic(files[0])
+        if bits is None and first.dtype == np.uint16:
+            raise ToolkitError(f"{files[0]} has 16 bits, of which 10, 12 or all may count; give --bits")
+        depth, most = 8 if bits is None else bits, 8 * first.dtype.itemsize
+        if not 1 <= depth <= most:
+            raise ToolkitError(
+                f"--bits {depth} does not fit {files[0]}, which holds {first.dtype}; give 1 to {most}"
+            )
+        height, width = first.shape
+        return RawMosaics(tuple(files), sensor(layout, height, width, depth), first.dtype)
+
+    def __iter__(self) -> Iterator[Raw]:
+        """(H, W) each.
+
+        Raises:
+            ToolkitError: a file is no mosaic, differs from the first in size or type, or has values that its
+                bits do not hold.
+        """
+        shape = (self.camera.height, self.camera.width)
+        for path in self.files:
+            pixels = read_mosaic(path)
+            if pixels.shape != shape or pixels.dtype != self.dtype:
+                raise ToolkitError(
+                    f"{path} is {pixels.shape} {pixels.dtype}, {self.files[0].name} is {shape} {self.dtype}; "
+                    "keep them in folders of their own"
+                )
+            if int(pixels.max()) > white_level(self.camera.bits):
+                raise ToolkitError(
+                    f"{path} holds the value {pixels.max()}, more than --bits {self.camera.bits} allow; "
+                    "give the bits that its camera has"
+                )
+            yield pixels
 
 
 def mosaic_files(folder: Path) -> list[Path]:

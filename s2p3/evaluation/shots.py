@@ -18,7 +18,7 @@ from calibration import Calibration
 from dataset import SE3, CameraInfo, Intrinsics
 from dataset.errors import ToolkitError
 from dataset.frames import SUPERPIXEL, Mosaic
-from dataset.importers.raw_folder import mosaic_files, read_mosaic
+from dataset.importers.raw_folder import RawMosaics
 from dataset.on_camera import decode_frame
 from dataset.polarimetry import Raw, remap
 from dataset.session import Session
@@ -62,17 +62,12 @@ def folder_shots(folder: Path, mosaic: Mosaic, bits: int | None, calibration: Ca
     Args:
         bits: significant bits of a value; must be given for 16-bit files.
 
-    Raises ToolkitError: no such files, unknown bits, another size than the calibrated one.
+    Raises ToolkitError: as `RawMosaics`, or another size than the calibrated one.
     """
-    files = mosaic_files(folder)
-    first = read_mosaic(files[0])
-    if bits is None and first.dtype == np.uint16:
-        raise ToolkitError(f"{files[0]} has 16 bits, of which 10, 12 or all may count; give --bits")
-    depth, (height, width) = bits or 8, first.shape
-    camera = CameraInfo("", "", "", "", f"Mono{depth}", mosaic, width, height, depth, 0)
-    decoder = _Decoder(camera, calibration, str(files[0]))
-    for path in files:
-        yield decoder.shot(path.name, read_mosaic(path), None, 0)
+    mosaics = RawMosaics.of(folder, mosaic, bits)
+    decoder = _Decoder(mosaics.camera, calibration, str(mosaics.files[0]))
+    for path, raw in zip(mosaics.files, mosaics, strict=True):
+        yield decoder.shot(path.name, raw, None, 0)
 
 
 def live_shots(rig: Rig, calibration: Calibration, count: int | None) -> Iterator[Shot]:

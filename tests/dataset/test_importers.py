@@ -243,6 +243,7 @@ def test_raw_mosaics_come_in(raw_folder: Path, tmp_path: Path) -> None:
         (None, None, "give --bits"),
         (8, None, "more than --bits 8"),
         (17, None, "does not fit"),
+        (0, None, "does not fit"),
         (12, "file,colour\na.png,red\n", "must name columns"),
         (12, "file,camera_time_ns\na.png,1\n", r"no row for b\.tiff"),
         (12, "file,camera_time_ns\na.png,1\nb.tiff,x\nc.npy,3\n", "holds no number"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,8 @@ import pytest
 
 from calibration import Calibration, IntrinsicsRecord
 from dataset import SE3
+from dataset.errors import ToolkitError
+from dataset.polarimetry import Raw
 from dataset.session import Session
 from s2p3.cli import main
 from s2p3.evaluation.predict import PoseEstimate
@@ -100,6 +103,34 @@ def test_a_folder_of_raw_frames_is_seen_as_the_session_is(
     assert [(row["frame"], row["T_base_obj"]) for row in rows] == [("0.png", None), ("1.png", None)]
 
 
+@pytest.mark.parametrize(
+    ("change", "bits", "said"),
+    [
+        (lambda raw: raw[:-4], 12, r"1\.png is .* uint16, 0\.png is .* uint16; keep them in folders"),
+        (lambda raw: (raw >> 4).astype(np.uint8), 12, r"1\.png is .* uint8, 0\.png is .* uint16"),
+        (lambda raw: raw | 4096, 12, r"1\.png holds the value \d+, more than --bits 12 allow; give"),
+        (lambda raw: raw, 17, r"--bits 17 does not fit .*0\.png, which holds uint16; give 1 to 16"),
+    ],
+)
+def test_a_later_frame_of_a_folder_is_checked_as_the_first(
+    change: Callable[[Raw], Raw], bits: int, said: str, folder: Path, tmp_path: Path
+) -> None:
+    calibration = Calibration.load(folder / "calibration.json")
+    raw = cv2.imread(str(folder / "0.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(tmp_path / "0.png"), raw)
+    cv2.imwrite(str(tmp_path / "1.png"), change(raw))
+    with pytest.raises(ToolkitError, match=said):
+        list(folder_shots(tmp_path, "mono", bits, calibration))
+
+
+def test_eight_bit_files_do_not_hold_twelve_bits(folder: Path, tmp_path: Path) -> None:
+    calibration = Calibration.load(folder / "calibration.json")
+    raw = cv2.imread(str(folder / "0.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(tmp_path / "0.png"), (raw >> 4).astype(np.uint8))
+    with pytest.raises(ToolkitError, match=r"--bits 12 does not fit .*0\.png, which holds uint8"):
+        next(folder_shots(tmp_path, "mono", 12, calibration))
+
+
 def test_the_base_frame_is_reached_through_the_camera(cup_session: Path) -> None:
     with Session.open(cup_session) as session:
         shot = next(session_shots(session, [0]))
@@ -119,6 +150,11 @@ def test_the_base_frame_is_reached_through_the_camera(cup_session: Path) -> None
         (".", [], "give --calibration calibration.json"),
         (".", ["--calibration", "calibration.json", "--mosaic", "mono"], "give --bits"),
         (".", ["--calibration", "nowhere.json"], "nowhere.json"),
+        (
+            ".",
+            ["--calibration", "calibration.json", "--mosaic", "mono", "--bits", "99"],
+            "0.png, which holds uint16; give",
+        ),
         (".", ["--count", "0"], "--count 0 is too small"),
     ],
 )

@@ -59,7 +59,7 @@ def synthesize(
     """
     from dataclasses import replace
 
-    from s2p3.synthesis import DOMAINS, Analytic, PathTraced, ViewsLike, add_depth, session_camera
+    from s2p3.synthesis import DOMAINS, Analytic, PathTraced, ViewsLike, session_camera
     from s2p3.synthesis import synthesize as render
 
     at_least(1, workers=workers, count=count)
@@ -74,11 +74,18 @@ def synthesize(
         say(renderer.engine.note)
     with counting("synthesize") as report:
         figures = render(
-            model, count, session_camera(intrinsics), seed, out, workers, report, chosen, renderer, executor
+            model,
+            count,
+            session_camera(intrinsics),
+            seed,
+            out,
+            workers,
+            report,
+            chosen,
+            renderer,
+            executor,
+            None if depth == "none" else depth,
         )
-    if depth != "none":
-        with counting("depth") as report:
-            add_depth(out, depth, report)
     say(f"{out}: {count} frames; {figures}")
 
 

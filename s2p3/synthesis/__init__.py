@@ -4,7 +4,7 @@ Two backends draw the same scenes: `Analytic`, fast and without shadows, and `Pa
 """
 
 from s2p3.synthesis.analytic_scene import Analytic
-from s2p3.synthesis.depth import DepthSensor, add_depth
+from s2p3.synthesis.depth import DepthSensor
 from s2p3.synthesis.domain import CAPTURED, DOMAINS, PLAIN, SYNTHETIC, Domain
 from s2p3.synthesis.drawing import draw_scene
 from s2p3.synthesis.frames import Recipe, session_camera
@@ -32,7 +32,6 @@ __all__ = [
     "SceneParameters",
     "Views",
     "ViewsLike",
-    "add_depth",
     "draw_scene",
     "render",
     "render_again",

@@ -7,17 +7,12 @@ all, and light goes through glass to what lies behind. How strongly is our choic
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dataset.session.edit import write_depth
-from s2p3.synthesis.manifest import recipe_of
 from s2p3.synthesis.scene import Scene
 
 DepthSensor = Literal["ideal", "tof"]
@@ -28,27 +23,6 @@ _STEP_M = 0.012  # a larger step within 3x3 pixels is a silhouette
 _METAL_M, _METAL_LOST = 0.05, 0.3  # how much too far, and share that is not measured at all
 _GLASS_SEEN, _GLASS_M = 0.25, 0.015  # share of glass that is measured, and how much too far
 _PATCH_PX = 6  # size of the patches in which a sensor errs alike
-
-
-def add_depth(
-    session: str | Path, sensor: DepthSensor, on_progress: Callable[[int, int], None] | None = None
-) -> None:
-    """Writes /depth into a synthetic session; its scenes are drawn again from its manifest.
-
-    Raises:
-        ToolkitError: the session has no manifest, or is not of this toolkit.
-    """
-    recipe, frames = recipe_of(session)
-    shape = (len(frames), recipe.intrinsics.height, recipe.intrinsics.width)
-    with TemporaryFile(dir=Path(session).parent) as file:  # a long session's would not fit into memory
-        images = np.memmap(file, np.uint16, "w+", shape=shape)
-        for index, image in enumerate(images):
-            rng = np.random.default_rng([recipe.seed, index, 2])
-            depth_mm = 1000 * sensed(recipe.draw(index).scene, sensor, rng)
-            image[:] = np.rint(depth_mm).clip(0, 65535)
-            if on_progress is not None:
-                on_progress(index + 1, len(frames))
-        write_depth(session, list(images))
 
 
 def scene_depth(scene: Scene) -> Image:

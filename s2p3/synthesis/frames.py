@@ -17,6 +17,7 @@ from dataset import Intrinsics, ToolkitError
 from dataset.polarimetry import decode
 from dataset.session import compress, mask_box
 from s2p3.objects import ObjectModel
+from s2p3.synthesis.depth import DepthSensor, sensed
 from s2p3.synthesis.domain import Domain
 from s2p3.synthesis.drawing import draw_scene
 from s2p3.synthesis.informativeness import Informativeness, measure
@@ -73,6 +74,7 @@ class Recipe:
         domain: what scenes are drawn from.
         backend: what renders them.
         seed: of the set.
+        depth: the depth camera beside it, or None.
     """
 
     model: ObjectModel
@@ -80,6 +82,7 @@ class Recipe:
     domain: Domain
     backend: Backend
     seed: int
+    depth: DepthSensor | None = None
 
     def draw(self, index: int) -> Drawn:
         """Frame `index`: it depends on nothing but the recipe, whoever draws it and in whatever order.
@@ -109,6 +112,14 @@ class Recipe:
         image = render(drawn.scene, self.backend, drawn.seed)
         return image, expose(image.stokes, drawn.scene.parameters, BITS, drawn.noise)
 
+    def depth_mm(self, drawn: Drawn, index: int) -> NDArray[np.uint16]:
+        """(h, w) of frame `index` as the depth camera measures it, 0: unknown; (0, 0) without one."""
+        if self.depth is None:
+            return np.zeros((0, 0), np.uint16)
+        rng = np.random.default_rng([self.seed, index, 2])
+        millimetres = 1000 * sensed(drawn.scene, self.depth, rng)
+        return np.rint(millimetres).clip(0, 65535).astype(np.uint16)
+
     def part(self, index: int) -> bytes:
         """Frame `index` with its truth, as `Part` reads it."""
         drawn = self.draw(index)
@@ -124,6 +135,7 @@ class Recipe:
             visible_fraction=image.visible_fraction,
             bbox_xywh=mask_box(image.mask),
             mask=np.packbits(image.mask),
+            depth=self.depth_mm(drawn, index),
             figures="" if figures is None else figures.to_json(),
             manifest=json.dumps(manifest_of(drawn, index)),
         )

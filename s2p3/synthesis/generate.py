@@ -12,8 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataset import SE3, CameraInfo, Intrinsics, RawFrame, SessionError, ToolkitError
+from dataset.importers.target import ReadWhenAsked
 from dataset.session import (
     Chunk,
     ObjectPoses,
@@ -23,8 +25,10 @@ from dataset.session import (
     write_object,
     write_poses,
 )
+from dataset.session.edit import write_depth
 from s2p3.objects import ObjectModel
 from s2p3.synthesis.analytic_scene import Analytic
+from s2p3.synthesis.depth import DepthSensor
 from s2p3.synthesis.domain import SYNTHETIC, Domain
 from s2p3.synthesis.executors import Executor, rendered
 from s2p3.synthesis.frames import BITS, Part, Recipe
@@ -45,6 +49,7 @@ def synthesize(
     domain: Domain = SYNTHETIC,
     backend: Backend | None = None,
     executor: Executor = "local",
+    depth: DepthSensor | None = None,
 ) -> Informativeness:
     """Render a training set and write it as a session; its camera is at the base frame's origin.
 
@@ -59,6 +64,7 @@ def synthesize(
         domain: what scenes are drawn from.
         backend: what renders them; `Analytic()` when None.
         executor: "local" processes or "ray".
+        depth: the depth camera that sees every frame, too; none when None.
 
     Returns:
         How much the set says about shape, measured on its first frames.
@@ -73,7 +79,7 @@ def synthesize(
     if count < 1:
         raise ToolkitError(f"{out}: a set needs at least one frame, not {count}")
     check_name(model.name)
-    recipe = Recipe(model, intrinsics.pinhole, domain, backend or Analytic(), seed)
+    recipe = Recipe(model, intrinsics.pinhole, domain, backend or Analytic(), seed, depth)
     with Parts.of(out, request_of(recipe)) as parts:
         missing = parts.missing(count)
         for done, (index, part) in enumerate(
@@ -115,6 +121,9 @@ def _assemble(recipe: Recipe, parts: Parts, count: int, out: Path) -> Informativ
     shape = (recipe.intrinsics.height, recipe.intrinsics.width)
     truth = ObjectPoses(SE3.stack(poses), np.array(visible), np.array(boxes), PackedMasks(masks, shape))
     write_poses(unfinished, SE3.identity((count,)), 0.0, 0.0, {recipe.model.name: truth})
+    if recipe.depth is not None:
+        depths = ReadWhenAsked[NDArray[np.uint16]](count, lambda index: Part(parts.path(index))["depth"])
+        write_depth(unfinished, depths)
     result = Informativeness.mean(figures)
     write_manifest(out, recipe, result, entries)
     result.draw(beside(out, "informativeness.png"), f"{recipe.model.name}, {backend}, {count} frames")

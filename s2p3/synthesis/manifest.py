@@ -1,6 +1,6 @@
 """What a synthetic set was made of, beside its session: enough to render any one frame again, to the bit.
 
-`set.manifest.json` holds the request (object, camera, domain, backend with versions, seed), an entry a frame
+`set.manifest.json` holds the request (object, cameras, domain, backend with versions, seed), an entry a frame
 (its seeds, pose and scene parameters, and a checksum of the whole scene) and how informative the set is.
 """
 
@@ -61,6 +61,7 @@ def request_of(recipe: Recipe) -> dict[str, Any]:
         "domain": dataclasses.asdict(recipe.domain),
         "backend": recipe.backend.describe(),
         "seed": recipe.seed,
+        "depth": recipe.depth,
     }
 
 
@@ -92,7 +93,8 @@ def recipe_of(session: str | Path) -> tuple[Recipe, list[dict[str, Any]]]:
         intrinsics = Intrinsics(np.array(camera["K"]), np.zeros(0), camera["height"], camera["width"])
         domain = _domain(request["domain"])
         backend = _backend(request["backend"])
-        recipe = Recipe(model, intrinsics, domain, backend, request["seed"])
+        depth = request.get("depth")  # which the first manifests do not have
+        recipe = Recipe(model, intrinsics, domain, backend, request["seed"], depth)
         frames: list[dict[str, Any]] = manifest["frames"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ToolkitError(

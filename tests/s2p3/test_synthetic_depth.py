@@ -13,6 +13,7 @@ from dataset.validate import validate
 from s2p3.cli import main
 from s2p3.objects import build
 from s2p3.synthesis import SYNTHETIC, Analytic, Recipe
+from s2p3.synthesis import depth as depth_module
 from s2p3.synthesis.depth import scene_depth, sensed, table_depth
 from s2p3.synthesis.scene import Scene
 
@@ -64,3 +65,29 @@ def test_a_set_is_synthesized_with_depth(tmp_path: Path) -> None:
             depth, mask = session.depth(index), poses.mask(index)
             centre = poses.T_cam_obj[index].translation[2]
             assert (np.abs(depth[mask] - centre) < 0.6 * build("cup").diameter).all()
+
+
+def test_a_set_that_was_interrupted_while_its_depth_was_computed_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "set.h5"
+    words = ["synthesize", "--object", "fork", "--count", "2", "--workers", "1", "--depth", "tof", "--out"]
+    calls = []
+
+    def interrupted(scene: Scene) -> depth_module.Image:
+        calls.append(scene)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return scene_depth(scene)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(depth_module, "scene_depth", interrupted)
+        assert main([*words, str(path)]) == 130
+    assert not path.exists()
+    assert main([*words, str(path)]) == 0
+    assert validate(path) == []
+    assert main([*words, str(tmp_path / "whole.h5")]) == 0
+    with Session.open(path) as found, Session.open(tmp_path / "whole.h5") as whole:
+        for index in range(2):
+            assert (found.depth(index) > 0).any()
+            np.testing.assert_array_equal(found.depth(index), whole.depth(index))

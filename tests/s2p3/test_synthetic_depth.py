@@ -54,6 +54,27 @@ def test_a_time_of_flight_camera_errs_on_metal_and_glass(name: str) -> None:
     np.testing.assert_array_equal(sensed(scene, "ideal", np.random.default_rng(0)), true)
 
 
+@pytest.mark.parametrize("share", [0.1, depth_module._GLASS_SEEN, depth_module._METAL_LOST, 0.9])
+def test_patches_take_the_share_that_is_asked_for(share: float) -> None:
+    for seed in range(3):
+        luck = depth_module._patches(np.random.default_rng(seed), (120, 160))
+        assert luck.shape == (120, 160)
+        assert (luck < share).mean() == pytest.approx(share, abs=1e-3)
+        assert np.abs(np.diff(luck, axis=1)).mean() < 0.15  # neighbours err alike; unrelated ones: 1/3
+        again = depth_module._patches(np.random.default_rng(seed), (120, 160))
+        np.testing.assert_array_equal(luck, again)
+
+
+def test_so_much_of_metal_is_not_measured() -> None:
+    scene = drawn("fork")
+    draws = map(np.random.default_rng, range(200))
+    measured = np.stack([sensed(scene, "tof", rng)[scene.mask] for rng in draws])
+    inside = (measured > 0).any(axis=0)  # a silhouette never is
+    assert inside.sum() > 50
+    lost = (measured[:, inside] == 0).mean()
+    assert lost == pytest.approx(depth_module._METAL_LOST, abs=0.05)
+
+
 def test_a_set_is_synthesized_with_depth(tmp_path: Path) -> None:
     path = tmp_path / "set.h5"
     words = ["synthesize", "--object", "cup", "--count", "2", "--workers", "1", "--depth", "ideal"]

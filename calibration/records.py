@@ -16,6 +16,7 @@ from calibration.polarizer import PolarizerResult
 from calibration.time_offset import TimeOffsetResult
 from calibration.tool_tip import ToolTipResult
 from dataset.errors import CalibrationError
+from dataset.frames import Mosaic
 from dataset.intrinsics import Intrinsics
 from dataset.transforms import SE3
 
@@ -53,7 +54,7 @@ class Source:
 @dataclass(frozen=True, eq=False)
 class IntrinsicsRecord:
     """K and distortion at the mosaic's grid; covariance (4 + n, 4 + n) of fx, fy, cx, cy, distortion; what is
-    odd, in words."""
+    odd, in words; the mosaic, None in a file written before it was kept."""
 
     intrinsics: Intrinsics
     covariance: Floats
@@ -62,10 +63,14 @@ class IntrinsicsRecord:
     views: int
     sources: tuple[Source, ...]
     warnings: tuple[str, ...] = ()
+    mosaic: Mosaic | None = None
 
     @staticmethod
     def of(
-        result: IntrinsicsResult, sources: tuple[Source, ...], warnings: tuple[str, ...] = ()
+        result: IntrinsicsResult,
+        sources: tuple[Source, ...],
+        warnings: tuple[str, ...] = (),
+        mosaic: Mosaic | None = None,
     ) -> IntrinsicsRecord:
         """The part of a result that is kept."""
         return IntrinsicsRecord(
@@ -76,6 +81,7 @@ class IntrinsicsRecord:
             int(result.used.sum()),
             sources,
             warnings,
+            mosaic,
         )
 
 

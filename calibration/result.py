@@ -225,4 +225,4 @@ def _decode_value(hint: Any, value: Any, at: str) -> Any:
     if value is None:
         return None
     options = getattr(hint, "__args__", ())
-    return _decode(options[0] if options else hint, value, at)
+    return _decode_value(options[0], value, at) if options else _decode(hint, value, at)

@@ -60,10 +60,10 @@ def add_intrinsics(
         found = detect_session(opened, spec, on_progress)
         found = [found[i] for i in select_views([d for _, d in found], spec)]
         result = intrinsics_from_session(opened, spec, found)
-        pictures = _pictures(opened, found)
+        pictures, mosaic = _pictures(opened, found), opened.camera.mosaic
     frames = [index for index, _ in found]
     warnings = remarks.of_intrinsics(result, frames)
-    record = IntrinsicsRecord.of(result, (Source.of(session),), warnings)
+    record = IntrinsicsRecord.of(result, (Source.of(session),), warnings, mosaic)
     kept = replace(known, hand_eye=None, fixed_camera=None, time_offset=None)
     kept.merged(Calibration(board=spec, intrinsics=record)).save(calibration)
     page = intrinsics_report(spec, result, frames, pictures, warnings, str(session))

@@ -62,7 +62,7 @@ def folder_shots(folder: Path, mosaic: Mosaic, bits: int | None, calibration: Ca
     Args:
         bits: significant bits of a value; must be given for 16-bit files.
 
-    Raises ToolkitError: as `RawMosaics`, or another size than the calibrated one.
+    Raises ToolkitError: as `RawMosaics`, or another size or mosaic than the calibrated one.
     """
     mosaics = RawMosaics.of(folder, mosaic, bits)
     decoder = _Decoder(mosaics.camera, calibration, str(mosaics.files[0]))
@@ -77,7 +77,7 @@ def live_shots(rig: Rig, calibration: Calibration, count: int | None) -> Iterato
     known without the arm.
 
     Raises ToolkitError: a device does not answer; the arm's tool setting is changed meanwhile; the
-        calibration is of another image size.
+        calibration is of another image size or mosaic.
     """
     with ExitStack() as stack:
         camera = stack.enter_context(open_camera(rig))
@@ -110,11 +110,16 @@ class _Decoder:
     def __init__(self, camera: CameraInfo, calibration: Calibration, where: str) -> None:
         calibration.require("intrinsics")
         assert calibration.intrinsics is not None
-        found = calibration.intrinsics.intrinsics
+        found, mosaic = calibration.intrinsics.intrinsics, calibration.intrinsics.mosaic
         if (found.height, found.width) != (camera.height, camera.width):
             raise ToolkitError(
                 f"{where} gives {camera.width}x{camera.height} pixels, the calibration is of "
                 f"{found.width}x{found.height}; calibrate this camera, or give its calibration.json"
+            )
+        if mosaic not in (None, camera.mosaic):
+            raise ToolkitError(
+                f"{where} is taken for a {camera.mosaic} mosaic, the calibration is of a {mosaic} one; give "
+                f"--mosaic {mosaic} with a folder, or the calibration.json of this camera"
             )
         working = found.at(SUPERPIXEL[camera.mosaic])
         self._camera = camera

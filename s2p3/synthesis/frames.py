@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataset import Intrinsics, ToolkitError
+from dataset.frames import SUPERPIXEL
 from dataset.polarimetry import decode
 from dataset.session import compress, mask_box
 from s2p3.objects import ObjectModel
@@ -38,10 +39,11 @@ PAPER_CAMERA = Intrinsics(
 
 
 def session_camera(calibration: str | Path | None = None) -> Intrinsics:
-    """The working image (the colour super-pixel, without distortion) of a calibrated camera.
+    """The working image (a pixel per super-pixel, without distortion) of a calibrated camera.
 
     Args:
-        calibration: calibration.json; the camera behind the paper's data when None.
+        calibration: calibration.json, of a colour camera where it does not say; the camera behind the paper's
+            data when None.
 
     Raises:
         ToolkitError: the file cannot be read, or holds no intrinsics.
@@ -53,7 +55,7 @@ def session_camera(calibration: str | Path | None = None) -> Intrinsics:
     record = Calibration.load(calibration).intrinsics
     if record is None:
         raise ToolkitError(f"{calibration} holds no intrinsics; run: s2p3 calibrate intrinsics")
-    return record.intrinsics.at(4).pinhole
+    return record.intrinsics.at(SUPERPIXEL[record.mosaic or "colour"]).pinhole
 
 
 class Drawn(NamedTuple):

@@ -24,7 +24,7 @@ def calibration(world, tmp_path):
     source = (Source.of(tmp_path / "a.h5"),)
     return Calibration(
         board=world.spec,
-        intrinsics=IntrinsicsRecord(world.intrinsics, np.eye(9), 0.1, float("nan"), 20, source),
+        intrinsics=IntrinsicsRecord(world.intrinsics, np.eye(9), 0.1, float("nan"), 20, source, (), "mono"),
         hand_eye=HandEyeRecord(
             world.T_tcp_cam, world.T_base_board, np.eye(12), 0.2, 0.1, 0.01, 3e-5, 5e-5, 22, source
         ),
@@ -41,12 +41,20 @@ def test_what_is_saved_is_loaded(calibration, tmp_path):
     assert loaded.board == calibration.board
     np.testing.assert_array_equal(loaded.intrinsics.intrinsics.K, calibration.intrinsics.intrinsics.K)
     assert np.isnan(loaded.intrinsics.held_out_px)
+    assert loaded.intrinsics.mosaic == "mono"
     np.testing.assert_array_equal(loaded.hand_eye.T_tcp_cam.rotation, calibration.hand_eye.T_tcp_cam.rotation)
     assert loaded.time_offset.offset_s == 0.031
     np.testing.assert_array_equal(loaded.tool_tip.tip_in_tcp, [0, 0, 0.12])
     assert loaded.objects["cup"].unobservable == ("its turn",)
     assert loaded.to_json() == path.read_text(encoding="utf-8")
     assert json.loads(loaded.to_json())["created_utc"] == calibration.created_utc
+
+
+@pytest.mark.parametrize("forget", [lambda c: c.pop("mosaic"), lambda c: c.update(mosaic=None)])
+def test_a_file_that_does_not_know_the_mosaic_is_read(calibration, forget):
+    content = json.loads(calibration.to_json())
+    forget(content["intrinsics"])
+    assert Calibration.from_json(json.dumps(content)).intrinsics.mosaic is None
 
 
 def test_inputs_are_named_by_their_sha256(calibration):
@@ -78,6 +86,7 @@ def test_a_missing_part_names_the_command():
         (lambda c: c["hand_eye"].pop("T_tcp_cam"), "T_tcp_cam is missing"),
         (lambda c: c["hand_eye"].update(covariance="?"), "covariance is missing or malformed"),
         (lambda c: c["board"].update(marker_m=1.0), "marker_m"),
+        (lambda c: c["intrinsics"].update(mosaic="cyan"), "mosaic is missing or malformed"),
     ],
 )
 def test_a_file_that_cannot_be_trusted_is_refused(calibration, change, reason):

@@ -73,6 +73,7 @@ def copied(known: Path, folder: Path) -> Path:
 def test_new_intrinsics_take_away_what_hung_on_the_old_ones(known: Path) -> None:
     found = Calibration.load(known)
     assert found.intrinsics is not None
+    assert found.intrinsics.mosaic == "colour"
     assert found.tool_tip is not None
     assert found.hand_eye is None
     assert found.fixed_camera is None

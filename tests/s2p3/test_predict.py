@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ import pytest
 from calibration import Calibration, IntrinsicsRecord
 from dataset import SE3
 from dataset.errors import ToolkitError
+from dataset.frames import Mosaic
 from dataset.polarimetry import Raw
 from dataset.session import Session
 from s2p3.cli import main
@@ -129,6 +131,18 @@ def test_eight_bit_files_do_not_hold_twelve_bits(folder: Path, tmp_path: Path) -
     cv2.imwrite(str(tmp_path / "0.png"), (raw >> 4).astype(np.uint8))
     with pytest.raises(ToolkitError, match=r"--bits 12 does not fit .*0\.png, which holds uint8"):
         next(folder_shots(tmp_path, "mono", 12, calibration))
+
+
+@pytest.mark.parametrize(("known", "given"), [("colour", "mono"), ("mono", "colour")])
+def test_a_folder_is_not_read_as_another_mosaic_than_the_calibrated(
+    known: Mosaic, given: Mosaic, folder: Path
+) -> None:
+    calibration = Calibration.load(folder / "calibration.json")
+    assert calibration.intrinsics is not None
+    knowing = replace(calibration, intrinsics=replace(calibration.intrinsics, mosaic=known))
+    with pytest.raises(ToolkitError, match=rf"0\.png is taken for a {given} mosaic, .* --mosaic {known}"):
+        next(folder_shots(folder, given, 12, knowing))
+    next(folder_shots(folder, known, 12, knowing))
 
 
 def test_the_base_frame_is_reached_through_the_camera(cup_session: Path) -> None:

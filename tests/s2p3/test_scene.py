@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration import Calibration, IntrinsicsRecord
 from dataset import Intrinsics, ToolkitError
+from dataset.frames import Mosaic
 from dataset.polarimetry import decode
 from dataset.session import Session
 from s2p3 import objects
@@ -193,6 +195,19 @@ def test_an_object_out_of_sight_is_an_error_that_says_so(tmp_path: Path) -> None
     far = replace(SYNTHETIC, views=Views(distance_m=(40.0, 50.0)))
     with pytest.raises(ToolkitError, match="hardly visible"):
         synthesize(CUP, 1, SMALL, 0, tmp_path / "far.h5", domain=far)
+
+
+@pytest.mark.parametrize(("mosaic", "side"), [("mono", 2), ("colour", 4), (None, 4)])
+def test_a_calibrated_cameras_working_image_has_a_pixel_per_superpixel(
+    mosaic: Mosaic | None, side: int, tmp_path: Path
+) -> None:
+    K = np.array([[1400.0, 0, 1223.5], [0, 1400.0, 1023.5], [0, 0, 1]])
+    lens = Intrinsics(K, np.zeros(5), 2048, 2448)
+    record = IntrinsicsRecord(lens, np.eye(9), 0.04, 0.05, 20, (), (), mosaic)
+    Calibration(intrinsics=record).save(tmp_path / "calibration.json")
+    camera = session_camera(tmp_path / "calibration.json")
+    assert (camera.height, camera.width) == (2048 // side, 2448 // side)
+    np.testing.assert_allclose(camera.K, lens.at(side).K)
 
 
 def test_the_default_camera_is_the_published_one() -> None:

@@ -24,7 +24,7 @@ GROWING: tuple[str, ...] = (
     "clocks/robot_pieces",
     "segments",
 )
-"""Datasets that grow while a session is recorded, beside the frames themselves."""
+"""Datasets that grow while a session of any kind is recorded, beside the frames themselves."""
 
 BEGINNING: tuple[tuple[str, int], ...] = (
     ("robot/tcp_offset", 6),
@@ -36,6 +36,11 @@ BEGINNING: tuple[tuple[str, int], ...] = (
 
 _COMPUTED = ("poses", "splits", "depth")
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+def growing(kind: str) -> tuple[str, ...]:
+    """Datasets that grow while a session of this kind is recorded, beside the frames themselves."""
+    return (*GROWING, "polarizer/angle") if kind == "polarizer" else GROWING
 
 
 def host_boot_id() -> str:
@@ -54,7 +59,7 @@ def open_to_continue(path: Path, kind: str, camera: CameraInfo) -> h5py.File:
     if reason is not None:
         raise SessionError(f"{path}: nothing can be appended, {reason}; record to a new file")
     file = h5py.File(path, "r+", libver=LIBVER)
-    for name in (*GROWING, *(name for name, _ in BEGINNING)):
+    for name in (*growing(kind), *(name for name, _ in BEGINNING)):
         reopen(file[name])
     file.flush()
     return file
@@ -79,7 +84,7 @@ def _why_not(file: h5py.File, kind: str, camera: CameraInfo) -> str | None:
             return f"its camera has {name} {found}, this one {expected}"
     if not host_boot_id() or attribute(file, "host_boot_id") != host_boot_id():
         return "it was recorded before this computer was restarted, on another one or by an older toolkit"
-    if any(name not in file for name in (*GROWING, *(name for name, _ in BEGINNING))):
+    if any(name not in file for name in (*growing(kind), *(name for name, _ in BEGINNING))):
         return "it was written by an older toolkit"
     computed = [name for name in _COMPUTED if name in file]
     if computed:

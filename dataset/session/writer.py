@@ -34,7 +34,7 @@ from dataset.schema import (
     declaration,
 )
 from dataset.session.clock_store import fit_stored, store
-from dataset.session.continuing import BEGINNING, GROWING, begin_segment, host_boot_id, open_to_continue
+from dataset.session.continuing import BEGINNING, begin_segment, growing, host_boot_id, open_to_continue
 from dataset.session.edit import store_intrinsics, store_object
 from dataset.session.files import LIBVER, create, dtype_of, hold, make_dataset, room
 from dataset.session.records import Clocks, ObjectRecord
@@ -321,8 +321,7 @@ def _lay_out(
     )
     raw = declaration("camera/raw")
     make_dataset(file, raw, raw.path, None, (0, camera.height, camera.width), dtype)
-    growing = [*GROWING, *(["polarizer/angle"] if kind == "polarizer" else [])]
-    for declared in map(declaration, growing):
+    for declared in map(declaration, growing(kind)):
         row = tuple(n for n in declared.shape[1:] if isinstance(n, int))
         make_dataset(file, declared, declared.path, None, (0, *row), dtype_of(declared))
     for path, size in BEGINNING:

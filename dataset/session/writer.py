@@ -261,11 +261,21 @@ class SessionWriter:
                 self._held = hold(self.path)
 
     def finish(self) -> None:
-        """Marks the file complete and closes it; nothing may be added afterwards."""
-        with self._writing("the end of the file") as file:
-            seal(file)
-            file.attrs["complete"] = True
-            file.flush()
+        """Marks the file complete and closes it, which it also does where the disk refuses; nothing may be
+        added afterwards.
+
+        Raises:
+            SessionError: the disk refuses the last bytes; the file is incomplete.
+        """
+        try:
+            with self._writing("the end of the file") as file:
+                seal(file)
+                file.attrs["complete"] = True
+                file.flush()
+        except BaseException:
+            with suppress(SessionError):  # the error on its way out is the one the user must see
+                self.close()
+            raise
         self.close()
 
     def close(self) -> None:

@@ -16,8 +16,8 @@ import h5py
 import numpy as np
 import pytest
 
-from dataset import RawFrame, SessionError
-from dataset.session import Session, write_split
+from dataset import CameraInfo, RawFrame, SessionError
+from dataset.session import Session, SessionWriter, write_split
 from dataset.session.superblock import lookup3
 from dataset.validate import info, repair, validate
 
@@ -148,6 +148,22 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, resource.RLIM_INFINITY))
     with Session.open(path) as session:
         for i in range(stored):
             np.testing.assert_array_equal(session.raw(i), make_frame(i).pixels)
+    assert validate(path) == []
+
+
+def test_a_disk_that_refuses_the_end_leaves_the_file_to_be_repaired(
+    tmp_path: Path, camera: CameraInfo, make_frame: Callable[..., RawFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(file: h5py.File) -> None:
+        raise OSError("No space left on device")
+
+    path = tmp_path / "s.h5"
+    writer = SessionWriter(path, "sequence", camera)
+    writer.add_frame(make_frame(0))
+    monkeypatch.setattr("dataset.session.writer.seal", refuse)
+    with pytest.raises(SessionError, match=r"end of the file could not be written \(No space left"):
+        writer.finish()
+    assert repair(path).frames == 1
     assert validate(path) == []
 
 

@@ -88,7 +88,7 @@ def repair(path: str | Path, on_progress: Progress = lambda done, total: None) -
             keep, damaged = _intact_frames(path, file, on_progress)
             ids = tuple(int(i) for i in file["camera/frame_id"][: len(keep) + len(damaged)][damaged])
             note = _note(len(keep), len(damaged))
-            whole = clean and not ids and len(file["camera/raw"]) == len(keep)
+            whole = clean and not ids and len(file["camera/raw"]) == len(keep) == _angles(file, len(keep))
             if whole and attribute(file, "complete"):
                 return RepairResult(path, False, len(keep), (), ())
             ended = clean and bool(attribute(file, "complete"))
@@ -141,6 +141,14 @@ def _intact_frames(
             intact[index] = False
         on_progress(index + 1, count)
     return np.flatnonzero(intact), np.flatnonzero(~intact)
+
+
+def _angles(file: h5py.File, frames: int) -> int:
+    """Frames that have their polarizer angle, unknown ones included; all, where no polarizer was turned."""
+    try:
+        return len(file["polarizer/angle"]) if "polarizer" in file else frames
+    except READ_ERRORS:
+        return 0
 
 
 def _copy(

@@ -91,8 +91,7 @@ def _walk(group: h5py.Group, prefix: str, lost: list[str]) -> Iterator[tuple[str
 def _rows(node: h5py.Dataset, declared: Dataset, keep: Indices, samples: int) -> NDArray[np.generic]:
     first = declared.shape[0] if declared.shape else None
     if first == "N":
-        rows: NDArray[np.generic] = node[: int(keep[-1]) + 1 if len(keep) else 0][keep]
-        return rows
+        return _frame_rows(node, keep)
     if first == "M":
         return np.asarray(node[:samples])
     if declared.path == "splits/*":
@@ -107,6 +106,18 @@ def _rows(node: h5py.Dataset, declared: Dataset, keep: Indices, samples: int) ->
         pieces[:, 0] = np.searchsorted(keep, pieces[:, 0])
         return np.asarray(pieces)
     return np.asarray(node[()], dtype=node.dtype)
+
+
+def _frame_rows(node: h5py.Dataset, keep: Indices) -> NDArray[np.generic]:
+    """Rows of these frames; NaN, hence unknown, for frames whose row had not been written yet."""
+    count = int(keep[-1]) + 1 if len(keep) else 0
+    stored: NDArray[np.generic] = node[:count]
+    if len(stored) < count:
+        if stored.dtype.kind != "f":
+            raise ValueError(f"{node.name} has {len(stored)} rows for {count} frames")
+        unknown = np.full((count - len(stored), *stored.shape[1:]), np.nan, stored.dtype)
+        stored = np.concatenate([stored, unknown])
+    return stored[keep]
 
 
 def _copy_images(

@@ -225,15 +225,14 @@ def _write_camera(target: h5py.File, parts: list[_Part], forget_clocks: bool) ->
 
 
 def _write_robot(target: h5py.File, parts: list[_Part], forget_clocks: bool) -> None:
-    traces = [part.session.robot for part in parts if part.session.robot is not None and not forget_clocks]
+    moved = [part.session for part in parts if part.session.robot is not None and not forget_clocks]
+    traces = [session.robot for session in moved]
     for name in ROBOT_COLUMNS:
         declared = declaration(f"robot/{name}")
         row = tuple(n for n in declared.shape[1:] if isinstance(n, int))
         none = np.empty((0, *row), dtype_of(declared))
         _put(target, f"robot/{name}", np.concatenate([none, *(getattr(trace, name) for trace in traces)]))
-    offsets = [
-        part.session.tcp_offset for part in parts if part.session.robot is not None and not forget_clocks
-    ]
+    offsets = [session.tcp_offset for session in moved]
     if any(not _equal(offsets[0], offset) for offset in offsets):
         raise SessionError(
             f"{parts[0].session.path} and the others were recorded with different tool offsets, a session "
@@ -241,6 +240,10 @@ def _write_robot(target: h5py.File, parts: list[_Part], forget_clocks: bool) -> 
         )
     known = next((offset for offset in offsets if offset is not None), np.full(6, np.nan))
     _put(target, "robot/tcp_offset", known)
+    payloads = [session.payload for session in moved]
+    alike = all(_equal(payloads[0], payload) for payload in payloads)
+    payload = payloads[0] if payloads and alike else None
+    _put(target, "robot/payload", np.full(4, np.nan) if payload is None else payload)
 
 
 def _equal(one: NDArray[np.float64] | None, other: NDArray[np.float64] | None) -> bool:
@@ -275,9 +278,10 @@ def _write_tables(target: h5py.File, parts: list[_Part], forget_clocks: bool) ->
         _put(target, path, np.concatenate(tables))
     for device in ("camera", "robot"):
         _put(target, f"clocks/{device}", np.full(3, np.nan))
-        clocks = [getattr(part.session.clocks, device) for part in parts]
-        firsts = [part.first_frame if device == "camera" else part.first_sample for part in parts]
-        if not forget_clocks and all(clock is not None for clock in clocks):
+        timed = [part for part in parts if device == "camera" or part.session.robot is not None]
+        clocks = [getattr(part.session.clocks, device) for part in timed]
+        firsts = [part.first_frame if device == "camera" else part.first_sample for part in timed]
+        if timed and not forget_clocks and all(clock is not None for clock in clocks):
             pieces = [row + first for clock, first in zip(clocks, firsts, strict=True) for row in clock.first]
             store(
                 target, device, DeviceClock(tuple(pieces), tuple(f for clock in clocks for f in clock.fits))

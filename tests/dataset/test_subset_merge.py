@@ -101,7 +101,13 @@ def make_part(
 ) -> Callable[..., Path]:
     """A calibrated recording of four frames that begins at some second on the host's clock."""
 
-    def make(name: str, second: int, camera: CameraInfo = camera, offset: float = 0.1) -> Path:
+    def make(
+        name: str,
+        second: int,
+        camera: CameraInfo = camera,
+        offset: float = 0.1,
+        payload: tuple[float, ...] | None = None,
+    ) -> Path:
         path = tmp_path / name
         with SessionWriter(path, "sequence", camera) as writer:
             for index in range(4):
@@ -112,7 +118,7 @@ def make_part(
                 )
             writer.add_drop(7, "queue full", 1_200_000_000 + 1_000_000_000 * second)
             trace = make_trace(20, start=500 * second)
-            writer.add_robot_trace(trace, [0, 0, offset, 0, 0, 0])
+            writer.add_robot_trace(trace, [0, 0, offset, 0, 0, 0], payload)
             writer.set_clocks(camera=ClockFit(1e9 * second, 1.0, 300.0), robot=ClockFit(-99e9, 1.0, 400.0))
         write_calibration(path, "{}", intrinsics)
         return path
@@ -138,6 +144,40 @@ def test_parts_keep_their_clocks(make_part: Callable[..., Path], tmp_path: Path)
         assert len(both.robot) == 40
         assert one.session_id in both.origin
         assert two.session_id in both.origin
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"), [((1.2, 0, 0, 0.05), [1.2, 0, 0, 0.05]), ((0.9, 0, 0, 0.05), None), (None, None)]
+)
+def test_the_payload_is_kept_where_the_parts_agree(
+    make_part: Callable[..., Path],
+    tmp_path: Path,
+    other: tuple[float, ...] | None,
+    expected: list[float] | None,
+) -> None:
+    parts = [make_part("a.h5", 0, payload=(1.2, 0, 0, 0.05)), make_part("b.h5", 5, payload=other)]
+    merge(parts, tmp_path / "both.h5")
+    assert validate(tmp_path / "both.h5") == []
+    with Session.open(tmp_path / "both.h5") as both:
+        assert (None if both.payload is None else both.payload.tolist()) == expected
+
+
+def test_a_part_without_an_arm_leaves_the_arm_of_the_others_its_clock(
+    make_part: Callable[..., Path], camera: CameraInfo, intrinsics: Intrinsics, tmp_path: Path
+) -> None:
+    bare, early, late = tmp_path / "bare.h5", make_part("early.h5", 0), make_part("late.h5", 5)
+    with Session.open(late) as session, SessionWriter(bare, "sequence", camera) as writer:
+        host = int(session.host_time_ns[-1]) + 10**9
+        writer.add_frame(RawFrame(session.raw(0), "BayerRG12p", 0, 0, host, 2000.0, 3.5, 0))
+        writer.set_clocks(camera=ClockFit(float(host), 1.0, 300.0))
+    write_calibration(bare, "{}", intrinsics)
+    merge([bare, early, late], tmp_path / "all.h5")
+    assert validate(tmp_path / "all.h5") == []
+    with Session.open(tmp_path / "all.h5") as whole, Session.open(early) as one:
+        assert whole.clocks.robot is not None
+        assert one.clocks.robot is not None
+        assert whole.clocks.robot.first == (0, 20)
+        assert whole.clocks.robot.fits[0] == one.clocks.robot.fits[0]
 
 
 def test_overlapping_parts_need_their_clocks_forgotten(

@@ -17,7 +17,7 @@ from dataset.frames import SUPERPIXEL
 from dataset.intrinsics import Intrinsics
 from dataset.polarizer_response import PolarizerResponse
 from dataset.schema import Dataset, checksums_of, declaration
-from dataset.session.files import dtype_of, make_dataset, open_for_editing
+from dataset.session.files import KEPT_FREE_BYTES, dtype_of, make_dataset, open_for_editing, room
 from dataset.session.records import Image, Images, ObjectPoses, ObjectRecord
 from dataset.session.seals import leave_open
 from dataset.transforms import SE3
@@ -44,7 +44,7 @@ def write_calibration(
         SessionError: the file cannot be edited, or the calibration is for another image size.
     """
     path = Path(path)
-    with open_for_editing(path) as file:
+    with open_for_editing(path, 0 if response is None else response.analysis.nbytes) as file:
         size = _mosaic_size(file)
         if intrinsics is not None and (intrinsics.height, intrinsics.width) != size:
             raise SessionError(
@@ -78,7 +78,7 @@ def write_object(path: str | Path, record: ObjectRecord) -> None:
     Raises:
         SessionError: the file cannot be edited, the name is not a plain word, or the arrays are no mesh.
     """
-    with open_for_editing(Path(path)) as file:
+    with open_for_editing(Path(path), record.vertices.nbytes + record.faces.nbytes) as file:
         store_object(file, record)
 
 
@@ -227,15 +227,22 @@ def store_images(
         declared: the images' declaration; `name` stands for the `*` in its path.
         images: N of them, each (h, w).
         shape, dtype: (N, h, w) and their type.
+
+    Raises:
+        OSError: the disk has no room for an image.
     """
+    beside, checksums = declaration(checksums_of(declared.path)), np.zeros(shape[0], np.uint32)
+    stored_checksums = make_dataset(  # before the images: what a cut leaves out must not read as black
+        file, beside, beside.path.replace("*", name), checksums, checksums.shape, np.uint32
+    )
     stored = make_dataset(file, declared, declared.path.replace("*", name), None, shape, dtype)
-    checksums = np.zeros(shape[0], np.uint32)
     for index, image in enumerate(images):
         chunk = compress(image)
+        if room(Path(file.filename)) < len(chunk.data) + KEPT_FREE_BYTES:
+            raise OSError(f"{KEPT_FREE_BYTES >> 20} MB are left on the disk")
         stored.id.write_direct_chunk((index, 0, 0), chunk.data)
         checksums[index] = chunk.crc32
-    beside = declaration(checksums_of(declared.path))
-    make_dataset(file, beside, beside.path.replace("*", name), checksums, checksums.shape, np.uint32)
+    stored_checksums[:] = checksums
 
 
 def _store_object_poses(file: h5py.File, path: Path, name: str, poses: ObjectPoses) -> None:

@@ -27,6 +27,9 @@ from dataset.session.superblock import HealedFile
 LIBVER = ("v110", "v110")
 """File format of HDF5 1.10: the oldest with single-writer-multiple-readers, readable by everything since."""
 
+KEPT_FREE_BYTES = 16 << 20
+"""What a write must leave free: the rest of the arm's trace needs room, and HDF5 can neither close a file on
+a full disk nor, in the same process, open it again (our choice)."""
 
 READ_ERRORS = (OSError, RuntimeError, KeyError, ValueError)
 """What h5py raises, depending on the place, when bytes in the file do not make sense."""
@@ -70,10 +73,7 @@ def create_whole(path: Path, needs_bytes: int) -> Iterator[h5py.File]:
         SessionError: the path exists or cannot be written, or the disk has no room.
     """
     check_new(path)
-    if room(path.parent) < needs_bytes:
-        raise SessionError(
-            f"{path} needs {needs_bytes / 1e9:.1f} GB of free disk space; make room and repeat"
-        )
+    _check_room(path, needs_bytes)
     partial = path.with_name(path.name + ".partial")
     try:
         with h5py.File(partial, "w", libver=LIBVER) as file:
@@ -141,11 +141,15 @@ def open_healed(path: Path) -> h5py.File:
 
 
 @contextmanager
-def open_for_editing(path: Path) -> Iterator[h5py.File]:
+def open_for_editing(path: Path, needs_bytes: int = 0) -> Iterator[h5py.File]:
     """Opens a finished session for adding to it; the file is closed, hence consistent, on leaving.
 
+    Args:
+        path: of the session.
+        needs_bytes: about how much is added, images aside.
+
     Raises:
-        SessionError: as `open_for_reading`, or the recording is incomplete.
+        SessionError: as `open_for_reading`, the recording is incomplete, or the disk has no room.
     """
     if path.is_file() and in_use(path):
         raise SessionError(f"{path} is in use by another program; wait for it or close it")
@@ -154,13 +158,20 @@ def open_for_editing(path: Path) -> Iterator[h5py.File]:
     file.close()
     if not complete:
         raise SessionError(f"{path} is incomplete; run first: s2p3 dataset repair {path}")
+    _check_room(path, needs_bytes + KEPT_FREE_BYTES)
     try:
         file = h5py.File(path, "r+", libver=LIBVER)
     except OSError as error:
         raise _explained(path, error) from error
-    with file:
-        yield file
-        seal(file)
+    try:
+        with file:
+            yield file
+            seal(file)
+    except (OSError, RuntimeError) as error:
+        raise SessionError(
+            f"{path} could not be written ({str(error).splitlines()[0]}), which costs no frame; check the "
+            f"free disk space, run s2p3 dataset repair {path}, and repeat what was being added"
+        ) from error
 
 
 def hold(path: Path) -> int:
@@ -274,6 +285,13 @@ def dtype_of(declared: Dataset) -> Any:
     if kind in TABLES:
         return np.dtype(TABLES[kind])
     return h5py.string_dtype() if kind == "text" else np.dtype("<" + kind)
+
+
+def _check_room(path: Path, needs_bytes: int) -> None:
+    if room(path if path.exists() else path.parent) < needs_bytes:
+        raise SessionError(
+            f"{path} needs {needs_bytes / 1e9:.2f} GB of free disk space; make room and repeat"
+        )
 
 
 def _explained(path: Path, error: OSError) -> SessionError:

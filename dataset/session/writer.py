@@ -36,13 +36,9 @@ from dataset.schema import (
 from dataset.session.clock_store import fit_stored, store
 from dataset.session.continuing import BEGINNING, begin_segment, growing, host_boot_id, open_to_continue
 from dataset.session.edit import store_intrinsics, store_object
-from dataset.session.files import LIBVER, create, dtype_of, hold, make_dataset, room
+from dataset.session.files import KEPT_FREE_BYTES, LIBVER, create, dtype_of, hold, make_dataset, room
 from dataset.session.records import Clocks, ObjectRecord
 from dataset.session.seals import leave_open, seal
-
-_KEPT_FREE_BYTES = 16 << 20
-"""A frame that would leave less is refused: the rest of the arm's trace needs room, and HDF5 can neither
-close a file on a full disk nor, in the same process, open it again (our choice)."""
 
 
 class SessionWriter:
@@ -159,8 +155,8 @@ class SessionWriter:
                     f"{self.path}: frame id {frame.frame_id} follows {self._last_id}; unwrap the camera's "
                     "counter and hand frames over in order"
                 )
-            if room(self.path) < len(chunk.data) + _KEPT_FREE_BYTES:
-                raise OSError(f"{_KEPT_FREE_BYTES >> 20} MB are left on the disk")
+            if room(self.path) < len(chunk.data) + KEPT_FREE_BYTES:
+                raise OSError(f"{KEPT_FREE_BYTES >> 20} MB are left on the disk")
             index = self._frames
             if self._clock_epoch is not None and frame.clock_epoch != self._clock_epoch:
                 begin_segment(file, index, self._samples)

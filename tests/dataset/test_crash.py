@@ -15,9 +15,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dataset import CameraInfo, RawFrame, SessionError
 from dataset.session import Session, SessionWriter, write_split
+from dataset.session.edit import write_depth
 from dataset.session.superblock import lookup3
 from dataset.validate import info, repair, validate
 
@@ -165,6 +167,29 @@ def test_a_disk_that_refuses_the_end_leaves_the_file_to_be_repaired(
         writer.finish()
     assert repair(path).frames == 1
     assert validate(path) == []
+
+
+def test_a_full_disk_is_noticed_before_an_edit(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = recorded.read_bytes()
+    monkeypatch.setattr("dataset.session.files.room", lambda path: 1 << 20)
+    with pytest.raises(SessionError, match=r"needs 0\.02 GB of free disk space; make room and repeat"):
+        write_split(recorded, "train", [0])
+    assert recorded.read_bytes() == before
+
+
+def test_images_of_an_edit_cut_short_do_not_read_as_black(
+    recorded: Path, make_depth: Callable[[int], NDArray[np.uint16]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = iter([1 << 30] * 5)
+    monkeypatch.setattr("dataset.session.edit.room", lambda path: next(left, 0))
+    with pytest.raises(SessionError, match=r"16 MB are left on the disk.*costs no frame.*repair"):
+        write_depth(recorded, make_depth(12))
+    assert repair(recorded).frames == 12
+    with Session.open(recorded) as session, pytest.raises(SessionError, match="damaged"):
+        session.depth(8)
+    monkeypatch.undo()
+    write_depth(recorded, make_depth(12))
+    assert validate(recorded) == []
 
 
 def test_a_killed_edit_is_named_and_undone(recorded: Path, make_frame: Callable[..., RawFrame]) -> None:

@@ -167,6 +167,13 @@ def _copy(
             "it; make room and repeat"
         )
     try:
+        for node in (file, file["camera"]):
+            dict(node.attrs)
+    except READ_ERRORS as error:
+        raise SessionError(
+            f"{path} is beyond repair: the description of its frames is lost ({error}); use a copy"
+        ) from error
+    try:
         with h5py.File(copy, "w", libver=LIBVER) as out:
             lost = copy_content(file, out, keep, damaged)
             if not ended:
@@ -175,7 +182,7 @@ def _copy(
             out.attrs.update({"complete": True, "repaired": note})
         with copy.open("rb") as stream:
             os.fsync(stream.fileno())
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise SessionError(
             f"{path}: the repaired copy cannot be written ({error}); free disk space"
         ) from error

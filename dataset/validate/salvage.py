@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dataset.compression import compress
 from dataset.schema import (
+    ATTRIBUTES,
     DATASETS,
     DROP_DTYPE,
     ROBOT_COLUMNS,
@@ -47,12 +48,11 @@ def copy_content(
     target.attrs.update(dict(source.attrs))
     samples = _readable_samples(source)
     for path, node in _walk(source, "", lost):
-        if isinstance(node, h5py.Group):
-            target.require_group(path).attrs.update(dict(node.attrs))
-            continue
         declared = declared_at(path)
         try:
-            if path == "camera/drops":
+            if isinstance(node, h5py.Group):
+                target.require_group(path).attrs.update(dict(node.attrs))
+            elif path == "camera/drops":
                 _copy_drops(source, target, gone, reason)
             elif declared is not None and declared.compressed:
                 lost += _copy_images(source, target, declared, path, keep)
@@ -66,6 +66,7 @@ def copy_content(
         except READ_ERRORS:
             lost.append(path)
             target.pop(path, None)
+    _drop_undescribed(target, lost)
     _restore_required(target)
     return tuple(lost)
 
@@ -151,6 +152,15 @@ def _readable_samples(source: h5py.File) -> int:
         return min(len(source[f"robot/{name}"][:]) for name in ROBOT_COLUMNS)
     except READ_ERRORS:
         return 0
+
+
+def _drop_undescribed(target: h5py.File, lost: list[str]) -> None:
+    """Removes objects without their description, which nobody could use."""
+    needed = {attribute.name for attribute in ATTRIBUTES if attribute.group == "/objects/*"}
+    for path in [f"objects/{name}" for name in target.get("objects", ())]:
+        if not needed <= set(target[path].attrs):
+            del target[path]
+            lost += [path] if path not in lost else []
 
 
 def _restore_required(target: h5py.File) -> None:

@@ -42,6 +42,26 @@ with SessionWriter(path, "sequence", camera) as writer:
         time.sleep(period)
 """
 
+ANNOTATE = """
+import os, resource, signal, sys
+import numpy as np
+from dataset import SE3, SessionError
+from dataset.session import ObjectPoses, ObjectRecord, mask_box, write_object, write_poses
+path, spare = sys.argv[1], int(sys.argv[2])
+masks = np.random.default_rng(0).random((12, 8, 12)) > 0.5
+poses = ObjectPoses(SE3.identity((12,)), np.ones(12), np.array([mask_box(m) for m in masks]), masks)
+mesh = np.vstack([np.zeros(3), 0.1 * np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3]], np.int32)
+size = os.path.getsize(path) + spare
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+try:
+    write_object(path, ObjectRecord("cup", *mesh, "plastic", 1.5, 0.0, "[]", 0.15))
+    write_poses(path, SE3.identity((12,)), 1e-3, 1e-3, {"cup": poses})
+    print("done", flush=True)
+except SessionError as error:
+    print(error, flush=True)
+"""
+
 
 def start_writer(path: Path, period: float) -> subprocess.Popen[str]:
     return subprocess.Popen(
@@ -167,6 +187,31 @@ def test_a_disk_that_refuses_the_end_leaves_the_file_to_be_repaired(
         writer.finish()
     assert repair(path).frames == 1
     assert validate(path) == []
+
+
+@pytest.mark.parametrize("spare", [0, 4000, 12000])
+def test_a_disk_that_fills_during_an_edit_costs_no_frame(
+    tmp_path: Path, camera: CameraInfo, make_frame: Callable[..., RawFrame], spare: int
+) -> None:
+    path = tmp_path / "s.h5"
+    with SessionWriter(path, "sequence", camera) as writer:
+        for i in range(12):
+            writer.add_frame(make_frame(i))
+
+    assert "s.h5 could not be written" in annotate(path, spare)
+    repair(path)
+    with Session.open(path) as session:
+        assert len(session) == 12
+        for i in range(12):
+            np.testing.assert_array_equal(session.raw(i), make_frame(i).pixels)
+    assert annotate(path, 1_000_000) == "done\n"
+    assert validate(path) == []
+
+
+def annotate(path: Path, spare: int) -> str:
+    """Adds an object and its poses in a process whose files may grow by so many bytes; what it says."""
+    command = [sys.executable, "-c", ANNOTATE, str(path), str(spare)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False).stdout
 
 
 def test_a_full_disk_is_noticed_before_an_edit(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -174,10 +174,8 @@ class PretrainConfig(SupervisedConfig):
     """Supervised training on synthetic sessions."""
 
     dense_weight: float = 1.0
-    """Weight of the teacher's dense losses (mask, coordinates, normals), our choice; 0: pose supervision
-    only."""
-    warm_start: Switch = False
-    """Student: start the encoders from the teacher's instead of ImageNet's."""
+    """Weight of the dense losses (mask, coordinates, normals) of a network with a decoder, the teacher or the
+    large student, our choice; 0: pose supervision only."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -112,16 +112,9 @@ def train_teacher(
     chosen = experiment.within(experiment_of(preset, config))
     if describe:
         _describe("teacher", chosen, json)
-        return
-    _all_given(object=object, out=out)
-    from s2p3.objects import named_object
-    from s2p3.training import train_teacher as train
-
-    _use(threads, frames.workers)
-    model = named_object(object, mesh)
-    with progress_bars() as report:
-        path = train(_some(sessions), model, chosen, out, cache=out.parent, frames=frames, report=report)
-    say(str(path))
+    else:
+        _all_given(object=object, out=out)
+        _supervise("teacher", sessions, object, mesh, chosen, out, threads, frames)
 
 
 def train_student(
@@ -130,7 +123,6 @@ def train_student(
     object: RequiredName = "",
     out: RequiredPath = Path(),
     mesh: OptionalPath = None,
-    teacher: OptionalPath = None,
     preset: Preset = "fast",
     config: OptionalPath = None,
     threads: int = 1,
@@ -146,7 +138,6 @@ def train_student(
         object: cup, fork, knife, bottle, or the name of the object in --mesh.
         out: folder for student.safetensors and the log; an interrupted training continues.
         mesh: PLY, OBJ or STL of the object, metres.
-        teacher: checkpoint to start the encoders from, where the experiment asks for a warm start.
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
         config: experiment.toml, whose fields override the preset's.
         threads: CPU threads of the network.
@@ -156,19 +147,9 @@ def train_student(
     chosen = experiment.within(experiment_of(preset, config))
     if describe:
         _describe("student", chosen, json)
-        return
-    _all_given(object=object, out=out)
-    from s2p3.objects import named_object
-    from s2p3.training import train_student as train
-
-    _use(threads, frames.workers)
-    if teacher is not None and not chosen.student.warm_start:
-        raise ToolkitError("--teacher is what a warm start starts from; add --config.student.warm-start True")
-    model = named_object(object, mesh)
-    common = (_some(sessions), model, chosen, out)
-    with progress_bars() as report:
-        path = train(*common, teacher=teacher, cache=out.parent, frames=frames, report=report)
-    say(str(path))
+    else:
+        _all_given(object=object, out=out)
+        _supervise("student", sessions, object, mesh, chosen, out, threads, frames)
 
 
 def train_supervised(
@@ -198,17 +179,8 @@ def train_supervised(
         config: experiment.toml, whose fields override the preset's.
         threads: CPU threads of the network.
     """
-    from s2p3.objects import named_object
-    from s2p3.training import train_student
-    from s2p3.training import train_teacher as train_on
-
-    _use(threads, frames.workers)
-    chosen, model = experiment.within(experiment_of(preset, config)), named_object(object, mesh)
-    train = train_on if network == "teacher" else train_student
-    common = (_some(sessions), model, chosen, out)
-    with progress_bars() as report:
-        path = train(*common, cache=out.parent, frames=frames, stage="supervised", report=report)
-    say(str(path))
+    chosen = experiment.within(experiment_of(preset, config))
+    _supervise(network, sessions, object, mesh, chosen, out, threads, frames, "supervised")
 
 
 def train_self_supervised(
@@ -259,6 +231,27 @@ def train_self_supervised(
     networks = (detector, teacher, student)
     with progress_bars() as report:
         path = adapt(session, split, model, *networks, out, settings, workers=workers, report=report)
+    say(str(path))
+
+
+def _supervise(
+    network: Literal["teacher", "student"],
+    sessions: list[Path],
+    name: str,
+    mesh: Path | None,
+    experiment: ExperimentConfig,
+    out: Path,
+    threads: int,
+    frames: FrameSource,
+    stage: Literal["pretrained", "supervised"] = "pretrained",
+) -> None:
+    from s2p3.objects import named_object
+    from s2p3.training import supervise
+
+    _use(threads, frames.workers)
+    common = (_some(sessions), named_object(name, mesh), experiment, out)
+    with progress_bars() as report:
+        path = supervise(network, *common, cache=out.parent, frames=frames, stage=stage, report=report)
     say(str(path))
 
 

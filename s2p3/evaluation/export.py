@@ -15,7 +15,7 @@ from s2p3.networks.onnx_files import write_onnx
 from s2p3.training import checkpoint
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.detection import load_detector
-from s2p3.training.pretrain import load_student, load_teacher
+from s2p3.training.supervised import load_student, load_teacher
 from s2p3.writable import check_folder
 
 WORKING_SIZE = (612, 512)

@@ -26,7 +26,7 @@ from s2p3.training.batches import form_input
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import single_crop
 from s2p3.training.detection import load_detector
-from s2p3.training.pretrain import load_student, load_teacher
+from s2p3.training.supervised import load_student, load_teacher
 
 PoseNetwork = Callable[[Tensor, Tensor], Tensor | TeacherOutput]
 """A teacher or student: polarization and priors to the head's nine numbers, or to all a teacher predicts."""

@@ -33,7 +33,6 @@ from s2p3.training.batch_norm import freeze_norms
 from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.crops import Crops, crops_hash
 from s2p3.training.loop import Forward, Losses, Run, optimize
-from s2p3.training.pretrain import model_tensors
 from s2p3.training.pseudo_labels import make_labels, pooled_maps
 from s2p3.training.self_supervised import (
     CapturedBatch,
@@ -43,6 +42,7 @@ from s2p3.training.self_supervised import (
     load_pair,
     visible_surface,
 )
+from s2p3.training.supervised import model_tensors
 
 
 def self_supervise_rgbd(

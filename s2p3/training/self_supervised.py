@@ -32,8 +32,8 @@ from s2p3.training.crops import Crops, crops_hash
 from s2p3.training.loop import Forward, Losses, Run, optimize
 from s2p3.training.mean_teacher import MeanTeacher
 from s2p3.training.physics_signal import captured_signal, report_signal
-from s2p3.training.pretrain import load_student, load_teacher, model_tensors
 from s2p3.training.pseudo_labels import PseudoLabels, labels_of, make_labels, pooled_maps, warp_labels
+from s2p3.training.supervised import load_student, load_teacher, model_tensors
 
 _BATCH_NORM_MOMENTUM = 0.02
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shutil
 from pathlib import Path
@@ -19,8 +20,8 @@ from s2p3.config import FrameSource
 from s2p3.evaluation import Estimator
 from s2p3.objects import ObjectModel
 from s2p3.symmetry import Symmetry
-from s2p3.training import checkpoint, labelled_crops, train_detector, train_student
-from s2p3.training.pretrain import load_student, load_teacher
+from s2p3.training import checkpoint, labelled_crops, supervise, train_detector
+from s2p3.training.supervised import load_student, load_teacher
 from tests.s2p3.untrained import save_untrained
 
 
@@ -134,7 +135,7 @@ def test_a_place_that_cannot_be_written_is_told(tmp_path: Path, cup_session: Pat
         checkpoint.save_tensors(Path("/proc/net.safetensors"), {"weight": torch.zeros(3)})
     (tmp_path / "file").touch()
     with pytest.raises(ToolkitError, match=r"file is a file, and a folder is needed in its place"):
-        train_student([cup_session], cup, presets.quick(), tmp_path / "file" / "runs")
+        supervise("student", [cup_session], cup, presets.quick(), tmp_path / "file" / "runs")
 
 
 def test_damaged_kept_crops_are_made_anew(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
@@ -177,7 +178,7 @@ def test_what_a_model_is_shows_in_its_fingerprint(cup: ObjectModel) -> None:
 
 def test_a_session_counts_once(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
     twice, config = [cup_session, cup_session], presets.quick()
-    for train in (train_student, train_detector):
+    for train in (functools.partial(supervise, "student"), train_detector):
         with pytest.raises(ToolkitError, match="this session was given before; name each one once"):
             train(twice, cup, config, tmp_path)
 
@@ -185,7 +186,7 @@ def test_a_session_counts_once(cup_session: Path, cup: ObjectModel, tmp_path: Pa
 def test_a_session_does_not_validate_itself(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
     frames = FrameSource(validation=str(cup_session))
     with pytest.raises(ToolkitError, match="this session was given before"):
-        train_student([cup_session], cup, presets.quick(), tmp_path, frames=frames)
+        supervise("student", [cup_session], cup, presets.quick(), tmp_path, frames=frames)
 
 
 def test_a_detector_knows_an_object_once(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
@@ -197,7 +198,7 @@ def test_frames_to_score_on_are_named_for_a_use(cup_session: Path, cup: ObjectMo
     base = presets.quick()
     config = dataclasses.replace(base, student=dataclasses.replace(base.student, validations=0))
     with pytest.raises(ToolkitError, match="validations = 0 scores nothing on 'test'"):
-        train_student([cup_session], cup, config, tmp_path, frames=FrameSource(validation="test"))
+        supervise("student", [cup_session], cup, config, tmp_path, frames=FrameSource(validation="test"))
 
 
 def test_a_finished_checkpoint_is_not_overwritten(
@@ -205,7 +206,7 @@ def test_a_finished_checkpoint_is_not_overwritten(
 ) -> None:
     before = networks["student"].read_bytes()
     with pytest.raises(ToolkitError, match=r"student.safetensors is there already; delete it to train anew"):
-        train_student([cup_session], cup, presets.quick(), networks["student"].parent)
+        supervise("student", [cup_session], cup, presets.quick(), networks["student"].parent)
     assert networks["student"].read_bytes() == before
 
 
@@ -214,4 +215,4 @@ def test_a_damaged_resume_file_is_refused(cup_session: Path, cup: ObjectModel, t
     with pytest.raises(
         ToolkitError, match=r"student.resume.safetensors: damaged .*; delete it to start anew"
     ):
-        train_student([cup_session], cup, presets.quick(), tmp_path)
+        supervise("student", [cup_session], cup, presets.quick(), tmp_path)

@@ -21,7 +21,7 @@ from s2p3.presets import fast
 from s2p3.training import loader
 from s2p3.training.crops import LabelledCrops, collate, labelled_crops
 from s2p3.training.loader import CropDataset, Share, Steps, stream
-from s2p3.training.pretrain import LabelledData
+from s2p3.training.supervised import LabelledData
 from s2p3.training.trees import named_tensors
 
 

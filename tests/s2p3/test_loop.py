@@ -22,11 +22,11 @@ from s2p3 import config, presets
 from s2p3.config import AugmentationConfig
 from s2p3.networks.teacher import TeacherOutput
 from s2p3.objects import ObjectModel
-from s2p3.training import train_student
+from s2p3.training import supervise
 from s2p3.training.checkpoint import Validation
 from s2p3.training.loop import Forward, Losses, Run, Score, Trained, optimize, rate_factor
-from s2p3.training.pretrain import load_student
 from s2p3.training.processes import Processes
+from s2p3.training.supervised import load_student
 from tests.s2p3.linear_run import SETTINGS, Numbers, Squares, network, run
 
 ROOT = Path(__file__).parents[2]
@@ -85,7 +85,7 @@ def test_two_processes_train_a_student_together(cup_session: Path, cup: ObjectMo
     words = ["train", "student", cup_session, "--object", "cup", "--config", tmp_path / "experiment.toml"]
     together, alone = tmp_path / "together", tmp_path / "alone"
     launch("-m", "s2p3", *words, "--workers", 0, "--out", together)
-    train_student([cup_session], cup, experiment, alone, cache=tmp_path)
+    supervise("student", [cup_session], cup, experiment, alone, cache=tmp_path)
     files = [{path.name for path in folder.iterdir()} for folder in (together, alone)]
     assert files[0] == files[1] >= {"student.safetensors", "student.json", "student.log.jsonl"}
     (line,), (expected,) = (

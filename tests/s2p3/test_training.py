@@ -40,17 +40,16 @@ from s2p3.training import (
     checkpoint,
     labelled_crops,
     self_supervise,
+    supervise,
     train_detector,
-    train_student,
-    train_teacher,
 )
 from s2p3.training.batches import form_input, form_targets
 from s2p3.training.crops import canonical_pose, content_hashes
 from s2p3.training.detection import box_distances, detector_losses
 from s2p3.training.examples import Examples, divide
-from s2p3.training.pretrain import ALL_FRAMES, load_student, load_teacher
 from s2p3.training.pseudo_labels import make_labels, warp_labels
 from s2p3.training.scoring import PoseScorer
+from s2p3.training.supervised import ALL_FRAMES, load_student, load_teacher
 
 
 def tiny() -> ExperimentConfig:
@@ -78,8 +77,8 @@ def crops(cup_session: Path, cup: ObjectModel) -> LabelledCrops:
 def trained(cup_session: Path, cup: ObjectModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with teacher and student of 24 steps, and their logs."""
     out = tmp_path_factory.mktemp("trained")
-    train_teacher([cup_session], cup, tiny(), out)
-    train_student([cup_session], cup, tiny(), out)
+    supervise("teacher", [cup_session], cup, tiny(), out)
+    supervise("student", [cup_session], cup, tiny(), out)
     return out
 
 
@@ -284,29 +283,10 @@ def test_a_resume_file_of_other_settings_is_refused(
 
     experiment = dataclasses.replace(tiny(), student=dataclasses.replace(tiny().student, checkpoint_every=2))
     with pytest.raises(KeyboardInterrupt):
-        train_student([cup_session], cup, experiment, tmp_path, report=stop)
+        supervise("student", [cup_session], cup, experiment, tmp_path, report=stop)
     other = dataclasses.replace(experiment, student=dataclasses.replace(experiment.student, seed=1))
     with pytest.raises(ToolkitError, match="other settings"):
-        train_student([cup_session], cup, other, tmp_path)
-
-
-def test_a_warm_start_takes_the_teachers_encoders(
-    trained: Path, cup_session: Path, cup: ObjectModel, tmp_path: Path
-) -> None:
-    student = dataclasses.replace(
-        tiny().student, warm_start=True, steps=1, learning_rate=0.0, ema=0.0, validations=0
-    )
-    experiment = dataclasses.replace(tiny(), student=student)
-    with pytest.raises(ToolkitError, match="warm_start"):
-        train_student([cup_session], cup, experiment, tmp_path)
-    teacher = trained / "teacher.safetensors"
-    other = dataclasses.replace(experiment, input=dataclasses.replace(experiment.input, aolp="angle"))
-    with pytest.raises(ToolkitError, match="encoders see other channels"):
-        train_student([cup_session], cup, other, tmp_path, teacher=teacher)
-    path = train_student([cup_session], cup, experiment, tmp_path, teacher=teacher)
-    wanted, found = load_file(teacher), load_file(path)
-    stem = "encoder.polarization.stem.0.weight"
-    assert torch.equal(wanted[stem], found[stem])
+        supervise("student", [cup_session], cup, other, tmp_path)
 
 
 def test_the_detector_learns(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:

@@ -65,10 +65,10 @@ from s2p3.synthesis import (
     synthesize,
 )
 from s2p3.synthesis.scene import Backend
-from s2p3.training import captured_crops, self_supervise, train_detector, train_student, train_teacher
+from s2p3.training import captured_crops, self_supervise, supervise, train_detector
 from s2p3.training.batch_norm import adapt_batch_norm
 from s2p3.training.checkpoint import CheckpointInfo, save
-from s2p3.training.pretrain import load_teacher
+from s2p3.training.supervised import load_teacher
 
 
 def make_sets(study: Study, workers: int) -> None:
@@ -101,12 +101,9 @@ def train_network(study: Study, what: str, seed: int) -> None:
     config, model, cache = study.experiment(seed), objects.build(study.name), study.out / "crops"
     if what == "detector":
         train_detector([study.detector_set], model, config, study.detector.parent)
-    elif what == TEACHER:
-        out = study.checkpoint(TEACHER, seed).parent
-        train_teacher(study.training_sets(), model, config, out, cache=cache)
     else:
-        out, teacher = study.checkpoint(BEFORE, seed).parent, study.checkpoint(TEACHER, seed)
-        train_student(study.training_sets(), model, config, out, teacher=teacher, cache=cache)
+        path = study.checkpoint(what, seed)
+        supervise(path.stem, study.training_sets(), model, config, path.parent, cache=cache)
 
 
 def find_captured(study: Study, name: str) -> None:
@@ -180,14 +177,13 @@ def run_study(study: Study, workers: int) -> None:
     """Every step whose file is missing."""
     study.out.mkdir(parents=True, exist_ok=True)
     check_settings(study)
-    guides: list[Job] = [(study.detector, train_network, (study, "detector", study.seeds[0]))]
-    # with the detector's answers come the students: they may start from their teacher's encoders
-    guided: list[Job] = [(study.found(name), find_captured, (study, name)) for name in study.captured]
+    networks: list[Job] = [(study.detector, train_network, (study, "detector", study.seeds[0]))]
+    detection: list[Job] = [(study.found(name), find_captured, (study, name)) for name in study.captured]
     adaptation: list[Job] = []
     evaluation: list[Job] = []
     for seed in study.seeds:
-        for jobs, row in ((guides, TEACHER), (guided, BEFORE)):
-            jobs.append((study.checkpoint(row, seed), train_network, (study, row, seed)))
+        for row in (TEACHER, BEFORE):
+            networks.append((study.checkpoint(row, seed), train_network, (study, row, seed)))
         for row in CHANGES:
             adaptation.append((study.checkpoint(row, seed), adapt_network, (study, row, seed)))
         judged = [(row, study.judged) for row in ROWS]
@@ -195,10 +191,8 @@ def run_study(study: Study, workers: int) -> None:
         for row, what in judged:
             evaluation.append((study.evaluation(row, seed, what), judge_network, (study, row, seed, what)))
     make_sets(study, workers)
-    run_all(guides, workers)
-    run_all(guided, workers)
-    run_all(adaptation, workers)
-    run_all(evaluation, workers)
+    for jobs in (networks, detection, adaptation, evaluation):
+        run_all(jobs, workers)
 
 
 def main() -> int:

@@ -31,7 +31,7 @@ from s2p3.rendering import rasterize
 from s2p3.training.batches import form_input, form_targets
 from s2p3.training.crops import LabelledCrops
 from s2p3.training.loader import CropDataset, Steps, stream
-from s2p3.training.pretrain import model_tensors, pose_terms
+from s2p3.training.supervised import model_tensors, pose_terms
 
 HEIGHT, WIDTH, BATCH = 512, 612, 16
 OBJECT = "cup"

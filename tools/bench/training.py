@@ -38,7 +38,7 @@ from s2p3.training.crops import labelled_crops
 from s2p3.training.examples import CropSource
 from s2p3.training.loader import CropDataset, Steps
 from s2p3.training.loop import Run, optimize
-from s2p3.training.pretrain import LabelledData, SupervisedObjective, model_tensors
+from s2p3.training.supervised import LabelledData, SupervisedObjective, model_tensors
 
 _AHEAD, _TIMED = 4, 8
 """Steps of a turn that are not timed, and that are."""

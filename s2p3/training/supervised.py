@@ -2,7 +2,7 @@
 bound, on annotated captured ones.
 
 The paper supervises both by poses alone: point matching for the rotation, L1 for the translation. The
-teacher's dense losses (`dense_weight`) and the warm start are our choice; `s2p3.presets.paper` has neither.
+teacher's dense losses (`dense_weight`) are our choice; `s2p3.presets.paper` is without.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from dataset.errors import ToolkitError
 from s2p3 import inputs, losses
-from s2p3.config import ExperimentConfig, FrameSource, PretrainConfig
+from s2p3.config import ExperimentConfig, FrameSource
 from s2p3.inputs import View
 from s2p3.networks.build import build_student, build_teacher
 from s2p3.networks.pose_head import decode_pose, ray_rotation, site_from_translation
@@ -28,19 +27,22 @@ from s2p3.objects import ObjectModel
 from s2p3.progress import Report, quiet
 from s2p3.training import checkpoint
 from s2p3.training.batches import Targets, as_predicted, form_input, form_targets
-from s2p3.training.checkpoint import CheckpointInfo, Kind
+from s2p3.training.checkpoint import CheckpointInfo
 from s2p3.training.examples import CropSource, Examples
-from s2p3.training.loop import Forward, Losses, Objective, Run, Score, optimize
+from s2p3.training.loop import Forward, Losses, Run, Score, optimize
 from s2p3.training.physics_signal import labelled_signal, report_signal
 from s2p3.training.scoring import PoseScorer
 
+PoseNetwork = Literal["teacher", "student"]
 Stage = Literal["pretrained", "supervised"]
 ALL_FRAMES = FrameSource()
 MODEL_POINTS = 300
+_BUILDERS = {"teacher": build_teacher, "student": build_student}
 _SYMMETRY_STEPS = 36
 
 
-def train_teacher(
+def supervise(
+    kind: PoseNetwork,
     sessions: Sequence[Path],
     model: ObjectModel,
     config: ExperimentConfig,
@@ -51,9 +53,11 @@ def train_teacher(
     stage: Stage = "pretrained",
     report: Report = quiet,
 ) -> Path:
-    """Pre-trains the teacher and writes `out`/teacher.safetensors, which is returned.
+    """Trains teacher or student and writes `out`/teacher.safetensors or student.safetensors, which is
+    returned.
 
     Args:
+        kind: which of the two.
         sessions: with poses of the object, usually synthetic.
         cache: folder for the crops, shared between trainings.
         frames: which of the sessions to train on, and how they reach the training.
@@ -62,101 +66,26 @@ def train_teacher(
 
     Raises ToolkitError: a session lacks the object; see also `loop.optimize`.
     """
-    path, settings = checkpoint.to_write(out / "teacher.safetensors"), config.teacher
+    path, settings = checkpoint.to_write(out / f"{kind}.safetensors"), getattr(config, kind)
     examples = Examples.of(sessions, model, config.input, settings, frames, cache, report)
+    if config.input.modality == "polarization":
+        signal = labelled_signal(examples.source, examples.rows, model)
+        report_signal(signal, path, config.self_supervision.physics)
     torch.manual_seed(settings.seed)
-    network = build_teacher(config, imagenet=True)
+    network = _BUILDERS[kind](config, imagenet=True)
+    data = LabelledData(examples.source, examples.rows, model.refractive_index, config)
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
-    run = Pretraining("teacher", model, config, settings, examples, stage)
-    return run.train(network, objective, path, frames.workers, report)
-
-
-def train_student(
-    sessions: Sequence[Path],
-    model: ObjectModel,
-    config: ExperimentConfig,
-    out: Path,
-    *,
-    teacher: Path | None = None,
-    cache: Path | None = None,
-    frames: FrameSource = ALL_FRAMES,
-    stage: Stage = "pretrained",
-    report: Report = quiet,
-) -> Path:
-    """Pre-trains the student and writes `out`/student.safetensors, which is returned.
-
-    Args:
-        teacher: checkpoint whose encoders to start from, where `config.student.warm_start` says so.
-
-    Others as `train_teacher`.
-
-    Raises ToolkitError: a warm start without a teacher, of another object, or of other encoders; see also
-        `train_teacher`.
-    """
-    path, settings = checkpoint.to_write(out / "student.safetensors"), config.student
-    examples = Examples.of(sessions, model, config.input, settings, frames, cache, report)
-    torch.manual_seed(settings.seed)
-    network = build_student(config, imagenet=True)
-    if settings.warm_start:
-        if teacher is None:
-            raise ToolkitError(
-                "student.warm_start needs the teacher's checkpoint; give it, or set warm_start = false"
-            )
-        guide, info = load_teacher(teacher, model)
-        if _encoders(info.config) != _encoders(config):
-            raise ToolkitError(
-                f"{teacher}: its encoders see other channels than the student's, or at another stride; "
-                "train both with one experiment.toml, or set student.warm_start = false"
-            )
-        network.encoder.load_state_dict(guide.encoder.state_dict())
-    objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
-    run = Pretraining("student", model, config, settings, examples, stage)
-    return run.train(network, objective, path, frames.workers, report)
-
-
-def _encoders(config: ExperimentConfig) -> tuple[str, str, int]:
-    """What encoders must share for the weights of one to suit the other."""
-    return config.input.modality, config.input.aolp, config.network.total_stride
-
-
-@dataclass(frozen=True)
-class Pretraining:
-    """One supervised run: what it is of, and what it learns from."""
-
-    kind: Kind
-    model: ObjectModel
-    config: ExperimentConfig
-    settings: PretrainConfig
-    examples: Examples
-    stage: Stage
-
-    def train(
-        self,
-        network: Student | Teacher,
-        objective: Objective,
-        path: Path,
-        workers: int,
-        report: Report,
-    ) -> Path:
-        """Optimizes `network` and writes the checkpoint `path`, which is returned."""
-        examples, index = self.examples, self.model.refractive_index
-        if self.config.input.modality == "polarization":
-            signal = labelled_signal(examples.source, examples.rows, self.model)
-            report_signal(signal, path, self.config.self_supervision.physics)
-        data = LabelledData(examples.source, examples.rows, index, self.config)
-        score = None
-        if examples.held_out is not None:
-            scorer = PoseScorer(examples.held_out, self.model, self.config)
-            score = Score(scorer.name, scorer, self.settings.validations, examples.origin)
-        rows = examples.rows.tolist()
-        fingerprint = f"{examples.hashes} {self.config} {self.model.fingerprint} {rows} {examples.origin}"
-        run = Run(self.kind, path, fingerprint, workers, report)
-        trained = optimize(network, data, objective, self.settings, run, score)
-        info = CheckpointInfo.of(
-            self.kind, self.stage, self.model, trained.step, self.config, examples.hashes, trained.validation
-        )
-        checkpoint.save(path, trained.network.state_dict(), info)
-        return path
+    score = None
+    if examples.held_out is not None:
+        scorer = PoseScorer(examples.held_out, model, config)
+        score = Score(scorer.name, scorer, settings.validations, examples.origin)
+    rows = examples.rows.tolist()
+    fingerprint = f"{examples.hashes} {config} {model.fingerprint} {rows} {examples.origin}"
+    run = Run(kind, path, fingerprint, frames.workers, report)
+    trained = optimize(network, data, objective, settings, run, score)
+    info = CheckpointInfo.of(kind, stage, model, trained.step, config, examples.hashes, trained.validation)
+    checkpoint.save(path, trained.network.state_dict(), info)
+    return path
 
 
 def load_teacher(path: Path, wanted: str | ObjectModel | None = None) -> tuple[Teacher, CheckpointInfo]:

@@ -27,9 +27,9 @@ def apply_calibration(session: Path, calibration: Calibration) -> Applied:
     included; objects annotated with it lose theirs: annotate again.
 
     Raises:
-        CalibrationError: nothing in the calibration concerns a camera; or the session holds poses that no
-            arm gave, as an import or a synthetic set does.
-        SessionError: the session cannot be edited, or is of another image size.
+        CalibrationError: nothing in the calibration concerns a camera; it is of another camera; or the
+            session holds poses that no arm gave, as an import or a synthetic set does.
+        SessionError: the session cannot be edited.
     """
     if calibration.intrinsics is None and calibration.polarizer is None:
         raise CalibrationError(
@@ -49,6 +49,7 @@ def apply_calibration(session: Path, calibration: Calibration) -> Applied:
                 f"{session}: holds poses that no arm's trace gave (imported or synthetic), and they would not"
                 " fit another calibration; apply it to a recording"
             )
+        calibration.require_camera(opened.camera, str(session))
     write_calibration(session, calibration.to_json(), intrinsics, response)
     known = 0
     if cameras is not None:

@@ -35,14 +35,17 @@ def add_polarizer(
         extinction_ratio: of the turned polarizer.
 
     Raises:
-        CalibrationError: as `calibrate_polarizer`.
+        CalibrationError: the intrinsics are of another camera; as `calibrate_polarizer`.
         SessionError: the session cannot be read.
     """
+    known = Calibration.load(calibration) if calibration.exists() else Calibration()
     with Session.open(session) as opened:
+        camera = opened.camera
+        if known.intrinsics is not None:
+            known.intrinsics.require_camera(camera, str(session))
         result = polarizer_from_session(opened, extinction_ratio, on_progress)
     file, digest = write_response(calibration, result.response)
-    record = PolarizerRecord.of(result, file, digest, (Source.of(session),))
-    known = Calibration.load(calibration) if calibration.exists() else Calibration()
+    record = PolarizerRecord.of(result, camera, file, digest, (Source.of(session),))
     known.merged(Calibration(polarizer=record)).save(calibration)
     page = html.page("Calibration report", str(session), [polarizer_section(result)])
     report_path(calibration, "polarizer").write_text(page, encoding="utf-8")

@@ -16,7 +16,7 @@ from calibration.polarizer import PolarizerResult
 from calibration.time_offset import TimeOffsetResult
 from calibration.tool_tip import ToolTipResult
 from dataset.errors import CalibrationError
-from dataset.frames import Mosaic
+from dataset.frames import CameraInfo, Mosaic
 from dataset.intrinsics import Intrinsics
 from dataset.transforms import SE3
 
@@ -54,7 +54,7 @@ class Source:
 @dataclass(frozen=True, eq=False)
 class IntrinsicsRecord:
     """K and distortion at the mosaic's grid; covariance (4 + n, 4 + n) of fx, fy, cx, cy, distortion; what is
-    odd, in words; the mosaic, None in a file written before it was kept."""
+    odd, in words; the camera's mosaic and serial number, None in a file written before they were kept."""
 
     intrinsics: Intrinsics
     covariance: Floats
@@ -64,13 +64,14 @@ class IntrinsicsRecord:
     sources: tuple[Source, ...]
     warnings: tuple[str, ...] = ()
     mosaic: Mosaic | None = None
+    camera_serial: str | None = None
 
     @staticmethod
     def of(
         result: IntrinsicsResult,
+        camera: CameraInfo,
         sources: tuple[Source, ...],
         warnings: tuple[str, ...] = (),
-        mosaic: Mosaic | None = None,
     ) -> IntrinsicsRecord:
         """The part of a result that is kept."""
         return IntrinsicsRecord(
@@ -81,7 +82,41 @@ class IntrinsicsRecord:
             int(result.used.sum()),
             sources,
             warnings,
-            mosaic,
+            camera.mosaic,
+            camera.serial,
+        )
+
+    def require_camera(self, camera: CameraInfo, where: str) -> None:
+        """Raises when these are not the intrinsics of a camera that gave ``where``.
+
+        Raises:
+            CalibrationError: another size or mosaic, or another serial number where both are known.
+        """
+        known = self.intrinsics
+        if (camera.width, camera.height) != (known.width, known.height):
+            raise CalibrationError(
+                f"{where}: pictures of {camera.width}x{camera.height} pixels, the intrinsics are for"
+                f" {known.width}x{known.height}; record everything at one resolution, without binning, or"
+                " calibrate the intrinsics again"
+            )
+        if self.mosaic not in (None, camera.mosaic):
+            raise CalibrationError(
+                f"{where}: a {camera.mosaic} mosaic, the intrinsics are for a {self.mosaic} one; give the"
+                " calibration of this camera"
+            )
+        require_same_camera(self.camera_serial, camera.serial, where)
+
+
+def require_same_camera(calibrated: str | None, serial: str, where: str) -> None:
+    """Raises when ``where`` came from a camera of another serial number than the calibrated one.
+
+    Raises:
+        CalibrationError: both are known and differ.
+    """
+    if calibrated and serial and serial != calibrated:
+        raise CalibrationError(
+            f"{where}: camera {serial}, the calibration is of camera {calibrated}; give the calibration of"
+            " this camera, or calibrate it"
         )
 
 
@@ -234,6 +269,7 @@ class PolarizerRecord:
         defective: share of pixels that are left out.
         frames: how many it was estimated from.
         warnings: what is odd, in words.
+        camera_serial: None in a file written before it was kept.
         folder: where the file lies; not part of calibration.json.
     """
 
@@ -248,10 +284,13 @@ class PolarizerRecord:
     frames: int
     warnings: tuple[str, ...]
     sources: tuple[Source, ...]
+    camera_serial: str | None = None
     folder: Path | None = field(default=None, metadata={"stored": False})
 
     @staticmethod
-    def of(result: PolarizerResult, file: Path, digest: str, sources: tuple[Source, ...]) -> PolarizerRecord:
+    def of(
+        result: PolarizerResult, camera: CameraInfo, file: Path, digest: str, sources: tuple[Source, ...]
+    ) -> PolarizerRecord:
         """The part of a result that is kept in calibration.json; the rest is in the file."""
         response = result.response
         alive = response.gain > 0
@@ -268,6 +307,7 @@ class PolarizerRecord:
             len(result.states.level),
             result.warnings,
             sources,
+            camera.serial,
             file.parent,
         )
 

@@ -24,16 +24,18 @@ from calibration.records import (
     Source,
     TimeOffsetRecord,
     ToolTipRecord,
+    require_same_camera,
 )
 from calibration.response_file import read_response
 from dataset.errors import CalibrationError
+from dataset.frames import CameraInfo
 from dataset.polarizer_response import PolarizerResponse
 from dataset.transforms import SE3
 
 Floats = NDArray[np.float64]
 
 FORMAT = "s2p3-calibration"
-VERSION = "1.1"
+VERSION = "1.2"
 CONVENTIONS = (
     "T_a_b (4x4) maps points of frame b to frame a; metres, radians, seconds; intrinsics in pixels of the raw"
     " mosaic, pixel centres at integer coordinates, OpenCV's distortion order; the covariance of a"
@@ -88,6 +90,17 @@ class Calibration:
                 raise CalibrationError(
                     f"calibration: {part} is missing; estimate it with `s2p3 calibrate {verb}` first"
                 )
+
+    def require_camera(self, camera: CameraInfo, where: str) -> None:
+        """Raises when this is not the calibration of a camera that gave ``where``.
+
+        Raises:
+            CalibrationError: as `IntrinsicsRecord.require_camera`, the polarizers' serial number included.
+        """
+        if self.intrinsics is not None:
+            self.intrinsics.require_camera(camera, where)
+        if self.polarizer is not None:
+            require_same_camera(self.polarizer.camera_serial, camera.serial, where)
 
     def to_json(self) -> str:
         """The text of calibration.json."""

@@ -91,28 +91,13 @@ def hand_eye_from_session(
 
     Raises:
         CalibrationError: as `detect_session` and `calibrate_hand_eye`, no robot trace, or intrinsics of
-            another resolution.
+            another camera.
     """
-    require_resolution(session, intrinsics)
+    intrinsics.require_camera(session.camera, str(session.path))
     detections = detect_session(session, spec) if detections is None else detections
     views, poses = views_at_rest(session, detections)
     corners, covariance = [d for _, d in views], intrinsics.covariance
     return calibrate_hand_eye(poses, corners, spec, intrinsics.intrinsics, covariance, mount, refine_camera)
-
-
-def require_resolution(session: Session, intrinsics: IntrinsicsRecord) -> None:
-    """Raises when a session's pictures are not of the size that the intrinsics are for.
-
-    Raises:
-        CalibrationError: naming both sizes.
-    """
-    camera, known = session.camera, intrinsics.intrinsics
-    if (camera.width, camera.height) != (known.width, known.height):
-        raise CalibrationError(
-            f"{session.path}: pictures of {camera.width}x{camera.height} pixels, the intrinsics are for"
-            f" {known.width}x{known.height}; record all sessions at one resolution, without binning, or"
-            " calibrate the intrinsics again"
-        )
 
 
 def views_at_rest(session: Session, detections: Detections) -> tuple[Detections, SE3]:
@@ -148,9 +133,9 @@ def time_offset_from_session(
 
     Raises:
         CalibrationError: as `detect_session` and `estimate_time_offset`, no robot trace, or intrinsics of
-            another resolution.
+            another camera.
     """
-    require_resolution(session, intrinsics)
+    intrinsics.require_camera(session.camera, str(session.path))
     detections = detect_session(session, spec) if detections is None else detections
     times, trace = arm_trace(session)
     chosen = [index for index, _ in detections]

@@ -32,7 +32,6 @@ from calibration.sessions import (
     detect_session,
     hand_eye_from_session,
     intrinsics_from_session,
-    require_resolution,
     time_offset_from_session,
     views_at_rest,
 )
@@ -49,7 +48,8 @@ def add_intrinsics(
     session: Path, spec: BoardSpec, calibration: Path, on_progress: Progress | None = None
 ) -> IntrinsicsRecord:
     """Estimates K and distortion from stills of the board. What was estimated with other intrinsics goes:
-    hand-eye, the fixed camera's place and the time offset; polarizers, tool tip and objects stay.
+    hand-eye, the fixed camera's place and the time offset, and another camera's polarizers; tool tip and
+    objects stay.
 
     Raises:
         CalibrationError: as `intrinsics_from_session`.
@@ -60,11 +60,13 @@ def add_intrinsics(
         found = detect_session(opened, spec, on_progress)
         found = [found[i] for i in select_views([d for _, d in found], spec)]
         result = intrinsics_from_session(opened, spec, found)
-        pictures, mosaic = _pictures(opened, found), opened.camera.mosaic
+        pictures, camera = _pictures(opened, found), opened.camera
     frames = [index for index, _ in found]
     warnings = remarks.of_intrinsics(result, frames)
-    record = IntrinsicsRecord.of(result, (Source.of(session),), warnings, mosaic)
+    record = IntrinsicsRecord.of(result, camera, (Source.of(session),), warnings)
     kept = replace(known, hand_eye=None, fixed_camera=None, time_offset=None)
+    if known.polarizer is not None and known.polarizer.camera_serial not in (None, camera.serial):
+        kept = replace(kept, polarizer=None)
     kept.merged(Calibration(board=spec, intrinsics=record)).save(calibration)
     page = intrinsics_report(spec, result, frames, pictures, warnings, str(session))
     report_path(calibration, "intrinsics").write_text(page, encoding="utf-8")
@@ -116,7 +118,7 @@ def add_hand_eye(
         # The same pictures must not count twice.
         prior = replace(prior, covariance=_NO_PRIOR * prior.covariance)
     with Session.open(session) as opened:
-        require_resolution(opened, prior)
+        prior.require_camera(opened.camera, str(session))
         found = detect_session(opened, spec, on_progress)
         views, _ = views_at_rest(opened, found)  # the result counts these, not all that show the board
         views = [views[i] for i in select_views([d for _, d in views], spec)]
@@ -182,7 +184,7 @@ def add_time_offset(
             " the rig file it was calibrated with, or run `s2p3 calibrate hand-eye` again"
         )
     with Session.open(session) as opened:
-        require_resolution(opened, known.intrinsics)
+        known.intrinsics.require_camera(opened.camera, str(session))
         found = detect_session(opened, spec, on_progress)
         result = time_offset_from_session(opened, spec, known.intrinsics, known.hand_eye, found)
     record = TimeOffsetRecord.of(result, (Source.of(session),))

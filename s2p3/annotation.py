@@ -55,7 +55,7 @@ def annotate(
         model: the object.
 
     Raises:
-        CalibrationError: a part is missing, or the object's pose was not calibrated.
+        CalibrationError: a part is missing, the object's pose was not calibrated, or the camera is another.
         SessionError: the session cannot be read or edited.
 
     Warns (ToolkitWarning) of an object annotated before whose pose this calibration does not hold: it loses
@@ -70,6 +70,7 @@ def annotate(
             "touch it and run `s2p3 calibrate object` first"
         )
     with Session.open(path) as session:
+        calibration.require_camera(session.camera, str(path))
         cameras = camera_poses(session, calibration)
         names = dict.fromkeys((model.name, *session.annotated))
     write_calibration(

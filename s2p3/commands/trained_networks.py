@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
+from dataset.frames import Mosaic
 from s2p3.commands.arguments import ObjectName, OptionalPath, at_least
 from s2p3.console_output import progress_bars, say, show
 
@@ -87,7 +88,9 @@ def predict(
     calibration: OptionalPath = None,
     split: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(optional)")] = None,
     count: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")] = None,
-    mosaic: Literal["mono", "colour"] = "colour",
+    mosaic: Annotated[
+        Mosaic | None, tyro.conf.arg(metavar="{mono,colour}", help_behavior_hint="(optional)")
+    ] = None,
     bits: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")] = None,
     out: OptionalPath = None,
 ) -> None:
@@ -102,7 +105,8 @@ def predict(
         calibration: calibration.json, for a folder and a live camera.
         split: of a session, the split to predict on; all frames by default.
         count: frames at most; a live camera goes on until Ctrl-C by default.
-        mosaic: of a folder, mono for cells of 2x2 pixels, colour for super-pixels of 4x4.
+        mosaic: of a folder, mono for cells of 2x2 pixels, colour for super-pixels of 4x4; by default as
+            calibrated.
         bits: of a folder, significant bits of a value; needed for 16-bit files.
         out: folder for the same lines, poses.jsonl, and an overlay of every frame.
     """

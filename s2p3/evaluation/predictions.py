@@ -99,7 +99,7 @@ def opened_source(
     calibration: Path | None,
     split: str | None,
     count: int | None,
-    mosaic: Mosaic,
+    mosaic: Mosaic | None,
     bits: int | None,
 ) -> Iterator[Iterator[Shot]]:
     """The shots of a session, a rig's camera or a folder, see `s2p3.evaluation.shots`.

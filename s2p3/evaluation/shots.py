@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from acquisition.rig import Rig, open_camera, open_pose_source
 from calibration import Calibration
 from dataset import SE3, CameraInfo, Intrinsics
-from dataset.errors import ToolkitError
 from dataset.frames import SUPERPIXEL, Mosaic
 from dataset.importers.raw_folder import RawMosaics
 from dataset.on_camera import decode_frame
@@ -56,15 +55,19 @@ def session_shots(session: Session, indices: Sequence[int]) -> Iterator[Shot]:
         yield Shot(str(index), stokes, session.working_intrinsics, place, int(times[index]), depth)
 
 
-def folder_shots(folder: Path, mosaic: Mosaic, bits: int | None, calibration: Calibration) -> Iterator[Shot]:
+def folder_shots(
+    folder: Path, mosaic: Mosaic | None, bits: int | None, calibration: Calibration
+) -> Iterator[Shot]:
     """The raw mosaics of a folder, by name.
 
     Args:
+        mosaic: where a calibration of before it was kept does not say which it is of.
         bits: significant bits of a value; must be given for 16-bit files.
 
     Raises ToolkitError: as `RawMosaics`, or another size or mosaic than the calibrated one.
     """
-    mosaics = RawMosaics.of(folder, mosaic, bits)
+    known = None if calibration.intrinsics is None else calibration.intrinsics.mosaic
+    mosaics = RawMosaics.of(folder, mosaic or known or "colour", bits)
     decoder = _Decoder(mosaics.camera, calibration, str(mosaics.files[0]))
     for path, raw in zip(mosaics.files, mosaics, strict=True):
         yield decoder.shot(path.name, raw, None, 0)
@@ -77,7 +80,7 @@ def live_shots(rig: Rig, calibration: Calibration, count: int | None) -> Iterato
     known without the arm.
 
     Raises ToolkitError: a device does not answer; the arm's tool setting is changed meanwhile; the
-        calibration is of another image size or mosaic.
+        calibration is of another camera.
     """
     with ExitStack() as stack:
         camera = stack.enter_context(open_camera(rig))
@@ -109,19 +112,9 @@ class _Decoder:
 
     def __init__(self, camera: CameraInfo, calibration: Calibration, where: str) -> None:
         calibration.require("intrinsics")
+        calibration.require_camera(camera, where)
         assert calibration.intrinsics is not None
-        found, mosaic = calibration.intrinsics.intrinsics, calibration.intrinsics.mosaic
-        if (found.height, found.width) != (camera.height, camera.width):
-            raise ToolkitError(
-                f"{where} gives {camera.width}x{camera.height} pixels, the calibration is of "
-                f"{found.width}x{found.height}; calibrate this camera, or give its calibration.json"
-            )
-        if mosaic not in (None, camera.mosaic):
-            raise ToolkitError(
-                f"{where} is taken for a {camera.mosaic} mosaic, the calibration is of a {mosaic} one; give "
-                f"--mosaic {mosaic} with a folder, or the calibration.json of this camera"
-            )
-        working = found.at(SUPERPIXEL[camera.mosaic])
+        working = calibration.intrinsics.intrinsics.at(SUPERPIXEL[camera.mosaic])
         self._camera = camera
         self._response = calibration.polarizer_response
         self._maps, self._pinhole = working.undistort_map(), working.pinhole

@@ -33,7 +33,7 @@ def detected(world, stills):
 def calibrated(world, stills, detected):
     with Session.open(stills[0]) as session:
         camera = intrinsics_from_session(session, world.spec, detected)
-        record = IntrinsicsRecord.of(camera, (Source.of(stills[0]),))
+        record = IntrinsicsRecord.of(camera, session.camera, (Source.of(stills[0]),))
         return camera, record, hand_eye_from_session(session, world.spec, record, detected)
 
 

@@ -11,9 +11,16 @@ import h5py
 import numpy as np
 import pytest
 
-from calibration import Calibration
+from calibration import Calibration, apply_calibration
 from calibration.detection import detect
-from calibration.records import FixedCameraRecord, HandEyeRecord, TimeOffsetRecord, ToolTipRecord
+from calibration.polarizer_steps import add_polarizer
+from calibration.records import (
+    FixedCameraRecord,
+    HandEyeRecord,
+    PolarizerRecord,
+    TimeOffsetRecord,
+    ToolTipRecord,
+)
 from calibration.sessions import arm_trace, detect_session, views_at_rest
 from calibration.steps import add_hand_eye, add_intrinsics, add_time_offset, report_path
 from dataset.errors import CalibrationError
@@ -88,6 +95,47 @@ def test_pictures_of_another_resolution_are_refused(world, stills, known: Path, 
     replace(before, intrinsics=halved).save(calibration)
     with pytest.raises(CalibrationError, match="2448x2048 pixels, the intrinsics are for 1224x1024"):
         add_hand_eye(stills[0], world.spec, calibration)
+
+
+def of_camera(serial: str, session: Path, folder: Path) -> Path:
+    """A copy of a session, as a camera of that serial number would have recorded it."""
+    path = Path(shutil.copy(session, folder / f"{serial}.h5"))
+    with h5py.File(path, "r+") as file:
+        file["camera"].attrs["serial"] = serial
+        leave_open(file["camera"])
+        seal(file)
+    return path
+
+
+def test_pictures_of_another_camera_are_refused(world, stills, known: Path, tmp_path: Path) -> None:
+    calibration, other = copied(known, tmp_path), of_camera("4711", stills[0], tmp_path)
+    said = "4711.h5: camera 4711, the calibration is of camera "
+    for step in (add_hand_eye, add_time_offset):
+        placed = HandEyeRecord(
+            world.T_tcp_cam, world.T_base_board, np.eye(12), 0.1, 0.1, 0.01, 1e-5, 1e-5, 20, ()
+        )
+        replace(Calibration.load(calibration), hand_eye=placed).save(calibration)
+        with pytest.raises(CalibrationError, match=said):
+            step(other, world.spec, calibration)
+    with pytest.raises(CalibrationError, match=said):
+        apply_calibration(other, Calibration.load(calibration))
+    with pytest.raises(CalibrationError, match=said):
+        add_polarizer(other, calibration)
+    apply_calibration(of_camera("", stills[0], tmp_path), Calibration.load(calibration))
+
+
+@pytest.mark.parametrize(("serial", "kept"), [("4711", False), (None, True)])
+def test_a_new_cameras_intrinsics_take_away_the_old_ones_polarizers(
+    serial: str | None, kept: bool, world, stills, tmp_path: Path
+) -> None:
+    calibration = tmp_path / "calibration.json"
+    (tmp_path / "response.npz").touch()
+    old = PolarizerRecord(
+        "response.npz", "0", np.ones(3), 0.01, 0.01, np.eye(2), 1e-3, 0.0, 72, (), (), serial, tmp_path
+    )
+    Calibration(polarizer=old).save(calibration)
+    add_intrinsics(stills[0], world.spec, calibration)
+    assert (Calibration.load(calibration).polarizer is not None) == kept
 
 
 def test_another_board_than_hand_eyes_is_refused_for_the_clocks(

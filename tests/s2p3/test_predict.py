@@ -140,9 +140,10 @@ def test_a_folder_is_not_read_as_another_mosaic_than_the_calibrated(
     calibration = Calibration.load(folder / "calibration.json")
     assert calibration.intrinsics is not None
     knowing = replace(calibration, intrinsics=replace(calibration.intrinsics, mosaic=known))
-    with pytest.raises(ToolkitError, match=rf"0\.png is taken for a {given} mosaic, .* --mosaic {known}"):
+    with pytest.raises(ToolkitError, match=rf"0\.png: a {given} mosaic, .* for a {known} one"):
         next(folder_shots(folder, given, 12, knowing))
-    next(folder_shots(folder, known, 12, knowing))
+    told, by_default = (next(folder_shots(folder, given, 12, knowing)) for given in (known, None))
+    np.testing.assert_array_equal(told.stokes, by_default.stokes)
 
 
 def test_the_base_frame_is_reached_through_the_camera(cup_session: Path) -> None:

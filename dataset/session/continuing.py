@@ -11,7 +11,7 @@ import numpy as np
 from dataset.errors import SessionError
 from dataset.frames import CameraInfo
 from dataset.schema import CAMERA_ATTRIBUTES, FRAME_COLUMNS, ROBOT_COLUMNS, SEGMENT_DTYPE
-from dataset.session.files import LIBVER, attribute, open_for_editing
+from dataset.session.files import attribute, closed_on_failure, open_for_editing, open_to_write
 from dataset.session.seals import reopen
 
 GROWING: tuple[str, ...] = (
@@ -58,10 +58,11 @@ def open_to_continue(path: Path, kind: str, camera: CameraInfo) -> h5py.File:
         reason = _why_not(file, kind, camera)
     if reason is not None:
         raise SessionError(f"{path}: nothing can be appended, {reason}; record to a new file")
-    file = h5py.File(path, "r+", libver=LIBVER)
-    for name in (*growing(kind), *(name for name, _ in BEGINNING)):
-        reopen(file[name])
-    file.flush()
+    file = open_to_write(path)
+    with closed_on_failure(path, file):
+        for name in (*growing(kind), *(name for name, _ in BEGINNING)):
+            reopen(file[name])
+        file.flush()
     return file
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -39,10 +40,11 @@ def create(path: Path) -> h5py.File:
     """A new empty file.
 
     Raises:
-        SessionError: the path exists or cannot be written.
+        SessionError: the path exists or cannot be written, or the disk is full.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _check_room(path, KEPT_FREE_BYTES)
         return h5py.File(path, "x", libver=LIBVER)
     except FileExistsError as error:
         raise SessionError(f"{path} already exists; choose another name or remove it first") from error
@@ -158,11 +160,18 @@ def open_for_editing(path: Path, needs_bytes: int = 0) -> Iterator[h5py.File]:
     file.close()
     if not complete:
         raise SessionError(f"{path} is incomplete; run first: s2p3 dataset repair {path}")
-    _check_room(path, needs_bytes + KEPT_FREE_BYTES)
-    try:
-        file = h5py.File(path, "r+", libver=LIBVER)
-    except OSError as error:
-        raise _explained(path, error) from error
+    with changing(path, needs_bytes) as file:
+        yield file
+
+
+@contextmanager
+def changing(path: Path, needs_bytes: int = 0) -> Iterator[h5py.File]:
+    """As `open_for_editing`, of an incomplete session, too.
+
+    Raises:
+        SessionError: as `open_to_write`, or a write fails.
+    """
+    file = open_to_write(path, needs_bytes)
     try:
         with file:
             yield file
@@ -171,6 +180,32 @@ def open_for_editing(path: Path, needs_bytes: int = 0) -> Iterator[h5py.File]:
         raise SessionError(
             f"{path} could not be written ({str(error).splitlines()[0]}), which costs no frame; check the "
             f"free disk space, run s2p3 dataset repair {path}, and repeat what was being added"
+        ) from error
+
+
+def open_to_write(path: Path, needs_bytes: int = 0) -> h5py.File:
+    """Opens a file that was closed cleanly.
+
+    Raises:
+        SessionError: missing, damaged or in use, or the disk has no room.
+    """
+    try:
+        _check_room(path, needs_bytes + KEPT_FREE_BYTES)
+        return h5py.File(path, "r+", libver=LIBVER)
+    except OSError as error:
+        raise _explained(path, error) from error
+
+
+@contextmanager
+def closed_on_failure(path: Path, file: h5py.File) -> Iterator[None]:
+    """Closes a file whose first bytes cannot be written. Raises SessionError: says so."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        with suppress(OSError, RuntimeError):
+            file.close()
+        raise SessionError(
+            f"{path} cannot be written ({str(error).splitlines()[0]}); check the free disk space"
         ) from error
 
 
@@ -187,9 +222,9 @@ def hold(path: Path) -> int:
 
 
 def room(path: Path) -> int:
-    """Bytes that can still be written to the disk that a file is on."""
+    """Bytes that can still be written to the disk that a file is on; plenty where it does not tell its size."""
     disk = os.statvfs(path)
-    return disk.f_bavail * disk.f_frsize
+    return disk.f_bavail * disk.f_frsize if disk.f_blocks else sys.maxsize
 
 
 def in_use(path: Path) -> bool:

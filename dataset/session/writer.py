@@ -36,7 +36,16 @@ from dataset.schema import (
 from dataset.session.clock_store import fit_stored, store
 from dataset.session.continuing import BEGINNING, begin_segment, growing, host_boot_id, open_to_continue
 from dataset.session.edit import store_intrinsics, store_object
-from dataset.session.files import KEPT_FREE_BYTES, LIBVER, create, dtype_of, hold, make_dataset, room
+from dataset.session.files import (
+    KEPT_FREE_BYTES,
+    closed_on_failure,
+    create,
+    dtype_of,
+    hold,
+    make_dataset,
+    open_to_write,
+    room,
+)
 from dataset.session.records import Clocks, ObjectRecord
 from dataset.session.seals import leave_open, seal
 
@@ -56,7 +65,8 @@ class SessionWriter:
         intrinsics: at the mosaic's grid, where they are known already (synthetic sessions).
 
     Raises:
-        SessionError: the path exists, the kind is unknown, or the camera's image is not whole super-pixels.
+        SessionError: the path exists, the kind is unknown, the camera's image is not whole super-pixels, or
+            the disk is full.
     """
 
     def __init__(
@@ -76,11 +86,17 @@ class SessionWriter:
                 f"a {camera.mosaic} mosaic of {camera.width}x{camera.height} pixels is not whole "
                 f"super-pixels; set the camera's width and height to multiples of {block}"
             )
-        file = create(Path(path))
-        _lay_out(file, kind, camera, rig_toml, _dtype_of(camera))
-        if intrinsics is not None:
-            store_intrinsics(file, intrinsics)
-        self._begin(Path(path), camera, file)
+        path = Path(path)
+        file = create(path)
+        try:
+            with closed_on_failure(path, file):
+                _lay_out(file, kind, camera, rig_toml, _dtype_of(camera))
+                if intrinsics is not None:
+                    store_intrinsics(file, intrinsics)
+            self._begin(path, camera, file)
+        except SessionError:
+            path.unlink(missing_ok=True)  # nothing was recorded: the name is free for the next attempt
+            raise
 
     @classmethod
     def append(cls, path: str | Path, kind: Kind, camera: CameraInfo) -> SessionWriter:
@@ -109,10 +125,17 @@ class SessionWriter:
         self._clock_epoch: int | None = None
         gaps = np.append(file["camera/drops"]["frame_id"], file["camera/pauses"]["last_id"])
         self.last_known_id = None if self._last_id is None else int(max(self._last_id, *gaps, -1))
-        file.swmr_mode = True
+        with closed_on_failure(path, file):
+            file.swmr_mode = True
         self._held = hold(path)
-        file.attrs.modify("complete", False)
-        begin_segment(file, self._frames, self._samples)
+        try:
+            with self._writing("the beginning"):
+                file.attrs.modify("complete", False)
+                begin_segment(file, self._frames, self._samples)
+        except SessionError:
+            with suppress(SessionError):  # the error on its way out is the one the user must see
+                self.close()
+            raise
 
     def __enter__(self) -> SessionWriter:
         return self
@@ -249,12 +272,13 @@ class SessionWriter:
             # a file being read while it grows may get no new groups: leave that mode for a moment
             file.close()
             os.close(self._held)
-            self._file = h5py.File(self.path, "r+", libver=LIBVER)
+            self._file = None
+            file = open_to_write(self.path)
             try:
-                store_object(self._file, record)
+                store_object(file, record)
             finally:
-                self._file.swmr_mode = True
-                self._held = hold(self.path)
+                file.swmr_mode = True
+                self._file, self._held = file, hold(self.path)
 
     def finish(self) -> None:
         """Marks the file complete and closes it, which it also does where the disk refuses; nothing may be

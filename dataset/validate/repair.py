@@ -22,6 +22,7 @@ from dataset.session.files import (
     LIBVER,
     READ_ERRORS,
     attribute,
+    changing,
     check_format,
     in_use,
     open_hdf5,
@@ -94,9 +95,9 @@ def repair(path: str | Path, on_progress: Progress = lambda done, total: None) -
             ended = clean and bool(attribute(file, "complete"))
             lost = () if whole else _copy(path, file, copy, keep, damaged, note, ended)
         if whole:
-            with h5py.File(path, "r+", libver=LIBVER) as file:
+            with changing(path) as file:
                 fit_stored(file)
-                seal(file)
+                seal(file)  # first: a file that is called complete is sealed
                 file.attrs.update({"complete": True, "repaired": note})
         else:
             os.replace(copy, path)

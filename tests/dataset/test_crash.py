@@ -222,6 +222,45 @@ def test_a_full_disk_is_noticed_before_an_edit(recorded: Path, monkeypatch: pyte
     assert recorded.read_bytes() == before
 
 
+def test_a_full_disk_is_noticed_before_a_recording(
+    tmp_path: Path, camera: CameraInfo, make_frame: Callable[..., RawFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = tmp_path / "begun.h5"
+    writer = SessionWriter(begun, "sequence", camera)
+    writer.add_frame(make_frame(0))
+    writer.close()  # incomplete, and whole: repair only marks it
+    monkeypatch.setattr("dataset.session.files.room", lambda path: 1 << 20)
+    with pytest.raises(SessionError, match=r"new\.h5 needs 0\.02 GB of free disk space"):
+        SessionWriter(tmp_path / "new.h5", "sequence", camera)
+    with pytest.raises(SessionError, match=r"begun\.h5 needs 0\.02 GB of free disk space"):
+        repair(begun)
+    monkeypatch.undo()
+    assert repair(begun).frames == 1
+    monkeypatch.setattr("dataset.session.files.room", lambda path: 1 << 20)
+    with pytest.raises(SessionError, match=r"begun\.h5 needs 0\.02 GB of free disk space"):
+        SessionWriter.append(begun, "sequence", camera)
+    monkeypatch.undo()
+    with SessionWriter.append(begun, "sequence", camera) as writer:
+        writer.add_frame(make_frame(1))
+    assert validate(begun) == []
+
+
+def test_a_disk_that_refuses_the_beginning_leaves_no_file(
+    tmp_path: Path, camera: CameraInfo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError("No space left on device")
+
+    for step in ("_lay_out", "begin_segment"):
+        monkeypatch.setattr(f"dataset.session.writer.{step}", refuse)
+        with pytest.raises(SessionError, match=r"new\.h5.* written \(No space left on device\); check"):
+            SessionWriter(tmp_path / "new.h5", "sequence", camera)
+        monkeypatch.undo()
+        assert not list(tmp_path.iterdir())
+    with SessionWriter(tmp_path / "new.h5", "sequence", camera):
+        pass
+
+
 def test_images_of_an_edit_cut_short_do_not_read_as_black(
     recorded: Path, make_depth: Callable[[int], NDArray[np.uint16]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

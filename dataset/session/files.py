@@ -222,7 +222,7 @@ def hold(path: Path) -> int:
 
 
 def room(path: Path) -> int:
-    """Bytes that can still be written to the disk that a file is on; plenty where it does not tell its size."""
+    """Bytes that can still be written to the disk that a file is on; no end of them where it does not say."""
     disk = os.statvfs(path)
     return disk.f_bavail * disk.f_frsize if disk.f_blocks else sys.maxsize
 

@@ -19,8 +19,16 @@ from numpy.typing import NDArray
 
 from dataset.compression import checksum
 from dataset.errors import SessionError
-from dataset.schema import FORMAT, MAJOR, VERSION, declaration, declared_at
-from dataset.session.files import attribute, check_new, create_whole, make_dataset, open_hdf5, reading
+from dataset.schema import FORMAT, MAJOR, VERSION, declared_at
+from dataset.session.files import (
+    attribute,
+    check_new,
+    create_whole,
+    make_dataset,
+    open_hdf5,
+    put_array,
+    reading,
+)
 from dataset.session.seals import leave_open
 from dataset.transforms import SE3
 
@@ -89,11 +97,13 @@ def _from_0_9(source: h5py.File, target: h5py.File) -> None:
             make_dataset(target, declared, path, node[()], node.shape, node.dtype)
 
     source.visititems(copy)
-    _put(target, "camera/camera_time_ns", np.rint(1e3 * source["camera/camera_time_us"][:]).astype(np.int64))
+    put_array(
+        target, "camera/camera_time_ns", np.rint(1e3 * source["camera/camera_time_us"][:]).astype(np.int64)
+    )
     for path in [path for path in ("poses/T_base_cam",) if path in source]:
-        _put(target, path, _matrices(source[path][:]))
+        put_array(target, path, _matrices(source[path][:]))
         for name in ("poses/sigma_t", "poses/sigma_r"):
-            _put(target, name, source[name][:])
+            put_array(target, name, source[name][:])
     for name in source.get("poses/objects", ()):
         old = source[f"poses/objects/{name}"]
         corners = old["bbox_xyxy"][:]
@@ -104,7 +114,7 @@ def _from_0_9(source: h5py.File, target: h5py.File) -> None:
             "mask_crc32": np.array([checksum(mask) for mask in old["mask"]], np.uint32),
         }
         for part, data in values.items():
-            _put(target, f"poses/objects/*/{part}", data, name)
+            put_array(target, f"poses/objects/*/{part}", data, name)
         source.copy(old["mask"], target, name=f"poses/objects/{name}/mask")
 
 
@@ -120,8 +130,3 @@ def _matrices(pose7: NDArray[np.float64]) -> NDArray[np.float64]:
     known = np.isfinite(pose7).all(axis=1)
     matrices[known] = SE3.from_quaternion(pose7[known, 3:], pose7[known, :3]).as_matrix()
     return matrices
-
-
-def _put(target: h5py.File, declared_path: str, data: NDArray[np.generic], name: str = "") -> None:
-    path = declared_path.replace("*", name)
-    make_dataset(target, declaration(declared_path), path, data, data.shape, data.dtype)

@@ -20,7 +20,7 @@ from dataset.schema import FRAME_COLUMNS, ROBOT_COLUMNS, SEGMENT_DTYPE, VERSION,
 from dataset.session import Session
 from dataset.session.clock_store import store
 from dataset.session.edit import store_images
-from dataset.session.files import check_new, create_whole, dtype_of, make_dataset, open_for_reading
+from dataset.session.files import check_new, create_whole, dtype_of, make_dataset, open_for_reading, put_array
 from dataset.session.seals import leave_open
 from dataset.subset import require_complete
 
@@ -191,7 +191,7 @@ def _write(target: h5py.File, parts: list[_Part], forget_clocks: bool) -> None:
     _write_poses(target, parts)
     for name in dict.fromkeys(name for part in parts for name in part.session.splits):
         chosen = [p.session.splits[name] + p.first_frame for p in parts if name in p.session.splits]
-        _put(target, "splits/*", np.concatenate(chosen), name)
+        put_array(target, "splits/*", np.concatenate(chosen), name)
 
 
 def _write_camera(target: h5py.File, parts: list[_Part], forget_clocks: bool) -> None:
@@ -212,7 +212,7 @@ def _write_camera(target: h5py.File, parts: list[_Part], forget_clocks: bool) ->
             columns = [column + part.id_shift for column, part in zip(columns, parts, strict=True)]
         if forget_clocks and name in ("camera_time_ns", "host_time_ns"):
             columns = [np.full_like(column, -1) for column in columns]
-        _put(target, f"camera/{name}", np.concatenate(columns))
+        put_array(target, f"camera/{name}", np.concatenate(columns))
     target["camera"].attrs.update(dict(parts[0].file["camera"].attrs))
     if sessions[0].has_depth:
         images = (s.contents.image("depth", i) for s in sessions for i in range(len(s)))
@@ -221,7 +221,7 @@ def _write_camera(target: h5py.File, parts: list[_Part], forget_clocks: bool) ->
         )
     angles = [session.polarizer_angles for session in sessions]
     if known := [angle for angle in angles if angle is not None]:
-        _put(target, "polarizer/angle", np.concatenate(known))
+        put_array(target, "polarizer/angle", np.concatenate(known))
 
 
 def _write_robot(target: h5py.File, parts: list[_Part], forget_clocks: bool) -> None:
@@ -231,7 +231,9 @@ def _write_robot(target: h5py.File, parts: list[_Part], forget_clocks: bool) -> 
         declared = declaration(f"robot/{name}")
         row = tuple(n for n in declared.shape[1:] if isinstance(n, int))
         none = np.empty((0, *row), dtype_of(declared))
-        _put(target, f"robot/{name}", np.concatenate([none, *(getattr(trace, name) for trace in traces)]))
+        put_array(
+            target, f"robot/{name}", np.concatenate([none, *(getattr(trace, name) for trace in traces)])
+        )
     offsets = [session.tcp_offset for session in moved]
     if any(not _equal(offsets[0], offset) for offset in offsets):
         raise SessionError(
@@ -239,11 +241,11 @@ def _write_robot(target: h5py.File, parts: list[_Part], forget_clocks: bool) -> 
             "has one; merge with --forget-clocks, which leaves the arm's traces out"
         )
     known = next((offset for offset in offsets if offset is not None), np.full(6, np.nan))
-    _put(target, "robot/tcp_offset", known)
+    put_array(target, "robot/tcp_offset", known)
     payloads = [session.payload for session in moved]
     alike = all(_equal(payloads[0], payload) for payload in payloads)
     payload = payloads[0] if payloads and alike else None
-    _put(target, "robot/payload", np.full(4, np.nan) if payload is None else payload)
+    put_array(target, "robot/payload", np.full(4, np.nan) if payload is None else payload)
 
 
 def _equal(one: NDArray[np.float64] | None, other: NDArray[np.float64] | None) -> bool:
@@ -275,9 +277,9 @@ def _write_tables(target: h5py.File, parts: list[_Part], forget_clocks: bool) ->
         for table in segments:
             table["first_sample"] = 0
     for path, tables in (("camera/drops", drops), ("camera/pauses", pauses), ("segments", segments)):
-        _put(target, path, np.concatenate(tables))
+        put_array(target, path, np.concatenate(tables))
     for device in ("camera", "robot"):
-        _put(target, f"clocks/{device}", np.full(3, np.nan))
+        put_array(target, f"clocks/{device}", np.full(3, np.nan))
         timed = [part for part in parts if device == "camera" or part.session.robot is not None]
         clocks = [getattr(part.session.clocks, device) for part in timed]
         firsts = [part.first_frame if device == "camera" else part.first_sample for part in timed]
@@ -293,13 +295,13 @@ def _write_poses(target: h5py.File, parts: list[_Part]) -> None:
     if not any(part.session.poses is not None for part in parts):
         return
     for name in ("T_base_cam", "sigma_t", "sigma_r"):
-        _put(target, f"poses/{name}", _stacked(parts, f"poses/{name}", np.nan))
+        put_array(target, f"poses/{name}", _stacked(parts, f"poses/{name}", np.nan))
     annotated = dict.fromkeys(name for part in parts for name in part.session.annotated)
     for name in annotated:
         root = f"poses/objects/{name}"
         for column, missing in (("T_cam_obj", np.nan), ("visible_fraction", 0.0), ("bbox_xywh", 0.0)):
             path = f"poses/objects/*/{column}"
-            _put(target, path, _stacked(parts, path, missing, name), name)
+            put_array(target, path, _stacked(parts, path, missing, name), name)
         size = parts[0].session.camera.working_size
         masks = (
             part.session.object_poses(name).mask(index).view(np.uint8)
@@ -323,8 +325,3 @@ def _stacked(parts: list[_Part], declared_path: str, missing: float, name: str =
         for part in parts
     ]
     return np.concatenate(columns)
-
-
-def _put(target: h5py.File, declared_path: str, data: NDArray[np.generic], name: str = "") -> None:
-    path = declared_path.replace("*", name)
-    make_dataset(target, declaration(declared_path), path, data, data.shape, data.dtype)

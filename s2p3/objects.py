@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull
-from scipy.spatial.distance import pdist
+from numpy.typing import NDArray
 
 from dataset import SE3, ToolkitError
 from dataset.errors import ToolkitWarning
+from dataset.meshes import diameter, load_mesh
 from dataset.session import ObjectPoses, ObjectRecord, Session
 from s2p3 import object_meshes
 from s2p3.materials import Kind, Material, load_material
@@ -27,7 +26,7 @@ from s2p3.rendering.mesh import Mesh
 from s2p3.symmetry import Proposal, Symmetry, holds, propose
 
 if TYPE_CHECKING:
-    import trimesh
+    pass
 
 SAME_SIZE = 0.01
 """Share of the diameter by which two meshes of one object may differ: one may be simplified."""
@@ -260,7 +259,8 @@ def load(path: str | Path, *, name: str | None = None, made_of: Material | None 
             not watertight.
     """
     path = Path(path)
-    mesh = _read(path)
+    mesh = load_mesh(path, f"give a PLY, OBJ or STL, or one of {', '.join(NAMES)}")
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces, dtype=np.int32)
     if not np.isfinite(vertices).all():
@@ -296,29 +296,6 @@ def load(path: str | Path, *, name: str | None = None, made_of: Material | None 
         made_of.albedo,
         made_of.roughness,
     )
-
-
-def diameter(vertices: ArrayLike) -> float:
-    """The largest distance between two of the points (V, 3), in their unit."""
-    points = np.asarray(vertices, dtype=np.float64)
-    if np.ptp(points, axis=0).min() > 0 and len(points) > 4:
-        points = points[ConvexHull(points).vertices]
-    return float(pdist(points).max())
-
-
-def _read(path: Path) -> trimesh.Trimesh:
-    import trimesh
-
-    if not path.is_file():
-        raise ToolkitError(f"{path}: no such mesh file; give a PLY, OBJ or STL, or one of {', '.join(NAMES)}")
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    except Exception as error:  # trimesh's readers raise whatever a malformed file provokes
-        raise ToolkitError(f"{path}: cannot be read as a mesh ({error}); give a PLY, OBJ or STL") from error
-    if len(mesh.faces) == 0:
-        raise ToolkitError(f"{path}: holds no faces; export a triangle mesh")
-    return mesh
 
 
 def _open_edges(faces: NDArray[np.int32]) -> int:

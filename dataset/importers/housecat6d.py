@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dataset.bop.layout import read_image
 from dataset.errors import ToolkitError
-from dataset.importers.mosaics import colour_mosaic
+from dataset.importers.mosaics import angle_images, colour_mosaic
 from dataset.importers.plain_pickle import read_plain_pickle
 from dataset.importers.target import (
     Imported,
@@ -31,8 +31,8 @@ from dataset.importers.target import (
     write_imported,
 )
 from dataset.importers.units import UNITS, Unit, check_distances, check_mesh
-from dataset.meshes import read_mesh, widest
-from dataset.polarimetry import ANGLES_DEG, Raw
+from dataset.meshes import diameter, read_mesh
+from dataset.polarimetry import Raw
 from dataset.session import ObjectRecord
 
 MODELS = "obj_models_small_size_final"
@@ -85,7 +85,7 @@ def import_housecat6d(
     numbers = _numbers(scene)
     instances = _instances(scene / "meta.txt")
     labels = [read_plain_pickle(scene / "labels" / f"{number:06d}_label.pkl") for number in numbers]
-    first = _angles(scene, numbers[0])
+    first = angle_images(scene, numbers[0])
     height, width = first.shape[1:3]
     seen = [set(np.unique(_numbered(scene, number)).tolist()) for number in numbers]
     objects = []
@@ -116,7 +116,7 @@ def import_housecat6d(
 
     def mosaics() -> Iterator[Raw]:
         for number in numbers:
-            yield colour_mosaic(_angles(scene, number))
+            yield colour_mosaic(angle_images(scene, number))
 
     return write_imported(out, imported, mosaics())
 
@@ -130,13 +130,6 @@ def _numbers(scene: Path) -> list[int]:
             "and _135"
         )
     return numbers
-
-
-def _angles(scene: Path, number: int) -> NDArray[np.uint8]:
-    images = [read_image(scene / "pol" / f"{number:06d}_{angle}.png") for angle in ANGLES_DEG]
-    if any(image.shape != images[0].shape or image.ndim != 3 or image.dtype != np.uint8 for image in images):
-        raise ToolkitError(f"{scene}/pol/{number:06d}_*.png are not four RGB images of one size, 8 bit")
-    return np.stack(images)
 
 
 def _numbered(scene: Path, number: int) -> NDArray[np.uint8]:
@@ -181,4 +174,4 @@ def _record(folder: Path, instance: _Instance, unit: Unit) -> ObjectRecord:
     vertices, faces = read_mesh(folder / instance.kind / f"{instance.name}.obj", UNITS[unit])
     check_mesh(instance.name, vertices)
     material, index = _MATERIALS.get(instance.kind, ("plastic", 1.5))
-    return ObjectRecord(instance.name, vertices, faces, material, index, 0.0, "{}", widest(vertices))
+    return ObjectRecord(instance.name, vertices, faces, material, index, 0.0, "{}", diameter(vertices))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
+from dataset.bop.layout import read_image
 from dataset.errors import ToolkitError
 from dataset.polarimetry import ANGLES_DEG, POLARIZER_CELL, Image, Raw, Stokes, encode
 
@@ -23,6 +26,18 @@ def colour_mosaic(images: NDArray[np.uint8] | NDArray[np.uint16]) -> Raw:
     for (row, column), channel in (((0, 0), 0), ((0, 1), 1), ((1, 0), 1), ((1, 1), 2)):
         bayer[:, row::2, column::2] = images[..., channel]
     return mono_mosaic(bayer)
+
+
+def angle_images(folder: Path, number: int) -> NDArray[np.uint8]:
+    """The images (4, h, w, 3) of a frame behind a polarizer, FOLDER/pol/NNNNNN_ANGLE.png.
+
+    Raises:
+        ToolkitError: one is missing, or they are not four RGB images of one size.
+    """
+    images = [read_image(folder / "pol" / f"{number:06d}_{angle}.png") for angle in ANGLES_DEG]
+    if any(image.shape != images[0].shape or image.ndim != 3 or image.dtype != np.uint8 for image in images):
+        raise ToolkitError(f"{folder}/pol/{number:06d}_*.png are not four RGB images of one size, 8 bit")
+    return np.stack(images)
 
 
 def mono_mosaic(images: NDArray[np.uint8] | NDArray[np.uint16]) -> Raw:

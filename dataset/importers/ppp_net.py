@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dataset.bop.layout import read_image, read_json, tables_of
 from dataset.errors import ToolkitError
-from dataset.importers.mosaics import colour_mosaic
+from dataset.importers.mosaics import angle_images, colour_mosaic
 from dataset.importers.target import (
     Imported,
     ImportedObject,
@@ -28,8 +28,8 @@ from dataset.importers.target import (
     write_imported,
 )
 from dataset.importers.units import UNITS, Unit, check_distances, check_mesh
-from dataset.meshes import read_mesh, widest
-from dataset.polarimetry import ANGLES_DEG, Raw
+from dataset.meshes import diameter, read_mesh
+from dataset.polarimetry import Raw
 from dataset.session import ObjectRecord
 
 K_612x512 = ((351.450, 0.0, 303.646), (0.0, 351.477, 251.423), (0.0, 0.0, 1.0))
@@ -74,9 +74,9 @@ def import_ppp_net(
         refractive_index=REFRACTIVE_INDICES.get(name, 1.5),
         extinction=0.0,
         symmetry=_symmetry(name),
-        diameter=widest(vertices),
+        diameter=diameter(vertices),
     )
-    size = _angles(folder, numbers[0]).shape[1:3]
+    size = angle_images(folder, numbers[0]).shape[1:3]
     with tables_of(folder):
         found = _annotation(folder, record, numbers, size, UNITS[pose_units])
         matrix = _matrix(folder, numbers[0], size)
@@ -92,16 +92,9 @@ def import_ppp_net(
 
     def mosaics() -> Iterator[Raw]:
         for number in numbers:
-            yield colour_mosaic(_angles(folder, number))
+            yield colour_mosaic(angle_images(folder, number))
 
     return write_imported(out, imported, mosaics())
-
-
-def _angles(folder: Path, number: int) -> NDArray[np.uint8]:
-    images = [read_image(folder / "pol" / f"{number:06d}_{angle}.png") for angle in ANGLES_DEG]
-    if any(image.shape != images[0].shape or image.ndim != 3 or image.dtype != np.uint8 for image in images):
-        raise ToolkitError(f"{folder}/pol/{number:06d}_*.png are not four RGB images of one size, 8 bit")
-    return np.stack(images)
 
 
 def _annotation(

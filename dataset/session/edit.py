@@ -17,7 +17,7 @@ from dataset.frames import SUPERPIXEL
 from dataset.intrinsics import Intrinsics
 from dataset.polarizer_response import PolarizerResponse
 from dataset.schema import Dataset, checksums_of, declaration
-from dataset.session.files import KEPT_FREE_BYTES, dtype_of, make_dataset, open_for_editing, room
+from dataset.session.files import dtype_of, make_dataset, open_for_editing, put_array, require_room
 from dataset.session.records import Image, Images, ObjectPoses, ObjectRecord
 from dataset.session.seals import leave_open
 from dataset.transforms import SE3
@@ -238,8 +238,7 @@ def store_images(
     stored = make_dataset(file, declared, declared.path.replace("*", name), None, shape, dtype)
     for index, image in enumerate(images):
         chunk = compress(image)
-        if room(Path(file.filename)) < len(chunk.data) + KEPT_FREE_BYTES:
-            raise OSError(f"{KEPT_FREE_BYTES >> 20} MB are left on the disk")
+        require_room(Path(file.filename), len(chunk.data))
         stored.id.write_direct_chunk((index, 0, 0), chunk.data)
         checksums[index] = chunk.crc32
     stored_checksums[:] = checksums
@@ -279,10 +278,7 @@ def _matrices(poses: SE3) -> NDArray[np.float64]:
 
 
 def _store(file: h5py.File, declared_path: str, data: ArrayLike, name: str = "") -> None:
-    data = np.asarray(data, dtype=np.float64)
-    make_dataset(
-        file, declaration(declared_path), declared_path.replace("*", name), data, data.shape, np.float64
-    )
+    put_array(file, declared_path, np.asarray(data, np.float64), name)
 
 
 def _mosaic_size(file: h5py.File) -> tuple[int, int]:

@@ -17,12 +17,12 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dataset.compression import filter_options
 from dataset.errors import SessionError
-from dataset.schema import FORMAT, MAJOR, TABLES, VERSION, Dataset
-from dataset.session.seals import leave_open, seal
+from dataset.schema import FORMAT, MAJOR, TABLES, VERSION, Dataset, declaration
+from dataset.session.seals import leave_open, plain, seal
 from dataset.session.superblock import HealedFile
 
 LIBVER = ("v110", "v110")
@@ -227,6 +227,12 @@ def room(path: Path) -> int:
     return disk.f_bavail * disk.f_frsize if disk.f_blocks else sys.maxsize
 
 
+def require_room(path: Path, bytes_: int) -> None:
+    """Raises OSError unless the disk takes so many bytes and keeps `KEPT_FREE_BYTES`."""
+    if room(path) < bytes_ + KEPT_FREE_BYTES:
+        raise OSError(f"{KEPT_FREE_BYTES >> 20} MB are left on the disk")
+
+
 def in_use(path: Path) -> bool:
     """Whether any program has the session open: recording, changing or reading it."""
     descriptor = os.open(path, os.O_RDONLY)
@@ -283,10 +289,7 @@ def reading(path: Path, part: str = "its table of contents") -> Iterator[None]:
 
 def attribute(node: h5py.Group, name: str) -> Any:
     """An attribute as a plain Python value; None where it is absent."""
-    value = node.attrs.get(name)
-    if isinstance(value, bytes):
-        return value.decode(errors="replace")
-    return value.item() if isinstance(value, np.generic) else value
+    return plain(node.attrs.get(name))
 
 
 def make_dataset(
@@ -312,6 +315,12 @@ def make_dataset(
     if not declared.compressed:
         leave_open(dataset)
     return dataset
+
+
+def put_array(file: h5py.File, declared_path: str, data: NDArray[Any], name: str = "") -> None:
+    """`make_dataset` of an array as it is; `name` stands for the `*` in the declaration's path."""
+    path = declared_path.replace("*", name)
+    make_dataset(file, declaration(declared_path), path, data, data.shape, data.dtype)
 
 
 def dtype_of(declared: Dataset) -> Any:

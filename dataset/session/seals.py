@@ -71,7 +71,7 @@ def digest(node: h5py.Group | h5py.Dataset) -> int:
     """CRC-32 of a dataset's bytes in row order (UTF-8 of a text), or of a group's covered attributes as a
     JSON object with sorted names."""
     if isinstance(node, h5py.Group):
-        values = {name: _plain(node.attrs.get(name)) for name in str(node.attrs[COVERED]).split()}
+        values = {name: plain(node.attrs.get(name)) for name in str(node.attrs[COVERED]).split()}
         return zlib.crc32(json.dumps(values, sort_keys=True).encode())
     if node.dtype.kind == "O":
         return zlib.crc32(str(node.asstr()[()]).encode())
@@ -83,7 +83,8 @@ def digest(node: h5py.Group | h5py.Dataset) -> int:
     return found
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """An attribute's value as a plain Python one."""
     if isinstance(value, bytes):
         return value.decode(errors="replace")
     return value.item() if isinstance(value, np.generic) else value

@@ -37,14 +37,13 @@ from dataset.session.clock_store import fit_stored, store
 from dataset.session.continuing import BEGINNING, begin_segment, growing, host_boot_id, open_to_continue
 from dataset.session.edit import store_intrinsics, store_object
 from dataset.session.files import (
-    KEPT_FREE_BYTES,
     closed_on_failure,
     create,
     dtype_of,
     hold,
     make_dataset,
     open_to_write,
-    room,
+    require_room,
 )
 from dataset.session.records import Clocks, ObjectRecord
 from dataset.session.seals import leave_open, seal
@@ -178,8 +177,7 @@ class SessionWriter:
                     f"{self.path}: frame id {frame.frame_id} follows {self._last_id}; unwrap the camera's "
                     "counter and hand frames over in order"
                 )
-            if room(self.path) < len(chunk.data) + KEPT_FREE_BYTES:
-                raise OSError(f"{KEPT_FREE_BYTES >> 20} MB are left on the disk")
+            require_room(self.path, len(chunk.data))
             index = self._frames
             if self._clock_epoch is not None and frame.clock_epoch != self._clock_epoch:
                 begin_segment(file, index, self._samples)

@@ -264,8 +264,8 @@ def test_a_disk_that_refuses_the_beginning_leaves_no_file(
 def test_images_of_an_edit_cut_short_do_not_read_as_black(
     recorded: Path, make_depth: Callable[[int], NDArray[np.uint16]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    left = iter([1 << 30] * 5)
-    monkeypatch.setattr("dataset.session.edit.room", lambda path: next(left, 0))
+    left = iter([1 << 30] * 6)
+    monkeypatch.setattr("dataset.session.files.room", lambda path: next(left, 0))
     with pytest.raises(SessionError, match=r"16 MB are left on the disk.*costs no frame.*repair"):
         write_depth(recorded, make_depth(12))
     assert repair(recorded).frames == 12

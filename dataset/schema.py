@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 FORMAT = "s2p3-session"
+SUFFIXES = (".h5", ".hdf5")
+"""What the names of session files end on."""
+
 MAJOR, MINOR = 1, 1
 VERSION = f"{MAJOR}.{MINOR}"
 

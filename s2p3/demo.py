@@ -34,12 +34,12 @@ from dataset.errors import ToolkitError
 from dataset.splits import split_session
 from s2p3 import objects
 from s2p3.annotation import annotate
+from s2p3.board import board_spec
 from s2p3.captured_stages import adapt, evaluate_split
 from s2p3.console_output import counting, progress_bars, recording, say
 from s2p3.demo_report import compare, write_report
 from s2p3.evaluation import Evaluation
 from s2p3.lab import LabTruth, Operator, RunningLab, found_lab, running_lab
-from s2p3.lab.scene import board_spec
 from s2p3.presets import PRESETS
 from s2p3.side_by_side import Training, run_side_by_side
 from s2p3.synthesis import SYNTHETIC, Views, session_camera, synthesize

@@ -13,6 +13,7 @@ from dataset.errors import ToolkitError
 from dataset.frames import Mosaic
 from dataset.pictures import Picture, angle, degree, intensity, nominal_camera_matrix, to_bytes
 from dataset.polarimetry import Raw, Stokes, decode
+from s2p3.image_priors import mosaic_priors
 from s2p3.physics import check_index, shape_priors
 from s2p3.rendering.rasterizer import Raster
 
@@ -61,11 +62,12 @@ def decode_picture(raw: Path, layout: Mosaic, out: Path, index: float) -> list[P
     """
     pixels = _read_mosaic(raw)
     check_index(index)
-    stokes = decode(pixels, layout, bits=_significant_bits(pixels))
-    priors = prior_normals(stokes, nominal_camera_matrix(*stokes.shape), index)
+    bits = _significant_bits(pixels)
+    stokes = decode(pixels, layout, bits)
+    priors, _ = mosaic_priors(pixels, layout, bits, index, nominal_camera_matrix(*stokes.shape))
     pictures = {"s0": intensity(stokes), "dolp": degree(stokes), "aolp": angle(stokes)} | {
         f"normals_{name}": normals(prior)
-        for name, prior in zip(("diffuse", "specular_1", "specular_2"), priors, strict=True)
+        for name, prior in zip(("diffuse", "specular_1", "specular_2"), _pixelwise(priors), strict=True)
     }
     out.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -77,8 +79,13 @@ def decode_picture(raw: Path, layout: Mosaic, out: Path, index: float) -> list[P
 
 def prior_normals(stokes: Stokes, K: NDArray[np.float64], index: float) -> NDArray[np.float32]:
     """(3, h, w, 3) the normals n_d, n_s1, n_s2 of one frame (paper, equation 5), camera frame."""
-    maps = shape_priors(torch.from_numpy(stokes.stack())[None], index, torch.from_numpy(K).float()[None])[0]
-    return maps.reshape(3, 3, *stokes.shape).permute(0, 2, 3, 1).numpy()
+    stack, camera = torch.from_numpy(stokes.stack()), torch.from_numpy(K).float()
+    return _pixelwise(shape_priors(stack[None], index, camera[None])[0].numpy())
+
+
+def _pixelwise(priors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(9, h, w) -> (3, h, w, 3)."""
+    return np.moveaxis(priors.reshape(3, 3, *priors.shape[1:]), 1, -1)
 
 
 def _read_mosaic(path: Path) -> Raw:

@@ -18,6 +18,7 @@ from dataset.bop.scene import Drawn, Scene
 from dataset.errors import SessionError, ToolkitError
 from dataset.intrinsics import Intrinsics
 from dataset.session import ObjectRecord, Session
+from dataset.subset import require_complete
 
 Progress = Callable[[int, int], None]
 
@@ -110,7 +111,7 @@ def _write_scenes(
     cameras = []
     for scene, path in enumerate(paths):
         with Session.open(path) as session:
-            annotated = {name: records[name] for name in session.contents.names("poses/objects")}
+            annotated = {name: records[name] for name in session.annotated}
             writer = Scene(session, folder / f"{scene:06d}", annotated, ids, draw)
             for index in _frames(path, frames):
                 writer.add(int(index))
@@ -124,8 +125,7 @@ def _write_scenes(
 
 def _frames(path: Path, split: str | None) -> NDArray[np.int64]:
     with Session.open(path) as session:
-        if not session.complete:
-            raise SessionError(f"{path} is incomplete; run first: s2p3 dataset repair {path}")
+        require_complete(session)
         return np.arange(len(session)) if split is None else session.frames_in(split)
 
 
@@ -133,7 +133,7 @@ def _objects(paths: Sequence[Path]) -> dict[str, ObjectRecord]:
     records: dict[str, ObjectRecord] = {}
     for path in paths:
         with Session.open(path) as session:
-            annotated = session.contents.names("poses/objects")
+            annotated = session.annotated
             if not annotated:
                 raise SessionError(f"{path} has no annotated object; run: s2p3 annotate {path}")
             for name in annotated:

@@ -232,6 +232,7 @@ def object_pose(
     from calibration.touch_steps import add_object, known_tip
     from calibration.touches import KnownTip
     from dataset.errors import ToolkitError
+    from dataset.schema import SUFFIXES
     from dataset.transforms import SE3
     from s2p3.objects import named_object
 
@@ -240,7 +241,7 @@ def object_pose(
     model = named_object(object, mesh)
     guess = None if rig is None else Rig.load(rig).frames.T_tcp_tip
     tip = KnownTip.exactly((0.0, 0.0, 0.0), ball_radius)  # a file of points was measured with it already
-    if any(path.suffix in (".h5", ".hdf5") for path in touches):
+    if any(path.suffix in SUFFIXES for path in touches):
         tip = known_tip(calibration, guess, ball_radius)
     symmetry = model.symmetry
     turns = SE3.from_matrix(symmetry.transforms) if len(symmetry.transforms) else None
@@ -295,9 +296,7 @@ def _apply(calibration: Path, sessions: tuple[Path, ...]) -> None:
 
 def board_of(rig: Path) -> BoardSpec:
     """The board a rig file describes."""
-    from dataclasses import asdict
-
     from acquisition.rig import Rig
-    from calibration import BoardSpec
+    from s2p3.board import board_spec
 
-    return BoardSpec(**asdict(Rig.load(rig).board))
+    return board_spec(Rig.load(rig).board)

@@ -32,4 +32,4 @@ def write_bop_results(path: Path, evaluation: Evaluation, scene_id: int, object_
 
 def bop_object_id(session: Session, object_name: str) -> int:
     """The id that exporting the session alone gives one of its objects."""
-    return 1 + sorted(session.contents.names("poses/objects")).index(object_name)
+    return 1 + sorted(session.annotated).index(object_name)

@@ -19,6 +19,7 @@ from dataset import SE3
 from dataset.errors import ToolkitError
 from dataset.frames import Mosaic
 from dataset.pictures import Picture, in_colour, to_bytes
+from dataset.schema import SUFFIXES
 from dataset.session import Session
 from s2p3.evaluation.predict import Estimator, Finder, PoseEstimate
 from s2p3.evaluation.shots import Shot, folder_shots, live_shots, session_shots
@@ -108,7 +109,7 @@ def opened_source(
         ToolkitError: it is none of them, or lacks its calibration.
         SessionError: no such split.
     """
-    if source.suffix == ".h5":
+    if source.suffix in SUFFIXES:
         with Session.open(source) as session:
             frames = range(len(session)) if split is None else session.frames_in(split)
             yield session_shots(session, [int(index) for index in frames][:count])

@@ -4,18 +4,17 @@ exposure.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acquisition.rig import BoardTable
 from acquisition.simulation.patterns import Pixels
-from calibration.board import BoardSpec, draw
+from calibration.board import draw
 from dataset import pixel_formats
 from dataset.transforms import SE3
 from s2p3 import objects
+from s2p3.board import board_spec
 from s2p3.lab.arm_pose import ArmPose
 from s2p3.lab.lighting import captured_light, captured_surface
 from s2p3.lab.polarizer import HandHeldPolarizer, lamp_through
@@ -90,11 +89,6 @@ class LabCamera:
         layout = pixel_formats.pixel_format(pixel_format)
         mosaic = self._sensor.expose(stokes, signal, layout.bits, layout.colour, self._rng)[:height, :width]
         return mosaic.astype(np.uint8) if layout.bits == 8 else mosaic
-
-
-def board_spec(board: BoardTable) -> BoardSpec:
-    """The board a rig file describes, as calibration knows it."""
-    return BoardSpec(**asdict(board))
 
 
 def camera_source(truth: str, arm_host: str, arm_hz: float) -> LabCamera:

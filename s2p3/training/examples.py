@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dataset.errors import ToolkitError
+from dataset.schema import SUFFIXES
 from dataset.session import Session
 from s2p3.config import FrameSource, InputConfig, SupervisedConfig
 from s2p3.objects import ObjectModel
@@ -115,7 +116,7 @@ def divide(
         order = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(settings.seed))]
         origin = f"{count} of {len(rows)} frames, drawn with seed {settings.seed}"
         return Division(order[count:].sort().values, order[:count].sort().values, None, origin)
-    if Path(validation).suffix == ".h5" or Path(validation).is_file():
+    if Path(validation).suffix in SUFFIXES or Path(validation).is_file():
         return Division(rows, nothing, Path(validation), f"the session {validation}")
     held_out = _of_split(sessions, shown, validation)
     rows = rows[~torch.isin(rows, held_out)]

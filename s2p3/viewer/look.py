@@ -59,8 +59,9 @@ class SessionLook:
         self.session = session
         self.calibrated = session.intrinsics is not None
         self.camera = session.working_intrinsics if self.calibrated else _nominal(session)
-        annotated = session.contents.names("poses/objects")
-        self.objects = tuple(name for name in session.objects if name in annotated and self.calibrated)
+        self.objects = tuple(
+            name for name in session.objects if name in session.annotated and self.calibrated
+        )
         records = {name: session.object(name) for name in self.objects}
         self._meshes = {name: Mesh.from_arrays(r.vertices, r.faces) for name, r in records.items()}
         self.refractive_index = records[self.objects[0]].refractive_index if self.objects else _NOMINAL_INDEX

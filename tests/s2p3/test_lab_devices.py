@@ -23,9 +23,9 @@ from calibration.sessions import arm_trace, rest_pose
 from dataset.errors import DeviceError
 from dataset.session import Session
 from dataset.transforms import SE3, rotation_error_deg, translation_error_mm
+from s2p3.board import board_spec
 from s2p3.lab import LabTruth, found_lab, running_lab
 from s2p3.lab.arm_pose import ArmPose
-from s2p3.lab.scene import board_spec
 
 pytestmark = pytest.mark.devices
 

@@ -11,8 +11,9 @@ from dataset.polarimetry import decode
 from dataset.polarizer_response import PolarizerResponse, nominal_orientation
 from dataset.transforms import SE3
 from s2p3 import objects, physics
+from s2p3.board import board_spec
 from s2p3.lab.rig import BOARD
-from s2p3.lab.scene import LabScene, board_spec
+from s2p3.lab.scene import LabScene
 from s2p3.lab.sensor import Sensor
 from s2p3.lab.truth import LabTruth, sample_truth
 from s2p3.rendering.rasterizer import rasterize

@@ -12,9 +12,9 @@ from acquisition.rig import Rig
 from dataset.errors import ToolkitError
 from dataset.transforms import SE3, rotation_error_deg, translation_error_mm
 from s2p3 import objects
+from s2p3.board import board_spec
 from s2p3.lab import LabTruth, found_lab
 from s2p3.lab.rig import BOARD, lab_rig
-from s2p3.lab.scene import board_spec
 from s2p3.lab.truth import sample_truth
 
 SIZE = board_spec(BOARD).size_m

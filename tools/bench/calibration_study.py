@@ -37,10 +37,11 @@ from dataset.intrinsics import Intrinsics
 from dataset.polarimetry import decode, quantize, white_level
 from dataset.transforms import SE3, interpolate_poses
 from s2p3 import objects
+from s2p3.board import board_spec
 from s2p3.lab.operator import PIVOT_POINT, contacts, tilts, tip_pose
 from s2p3.lab.polarizer import lamp_through
 from s2p3.lab.rig import BOARD, lab_rig
-from s2p3.lab.scene import LabScene, board_spec
+from s2p3.lab.scene import LabScene
 from s2p3.lab.sensor import Sensor, made_sensor
 from s2p3.lab.truth import LabTruth, sample_truth
 

@@ -26,9 +26,9 @@ from scipy.spatial.transform import Rotation
 from calibration.object_pose import register_points
 from dataset.transforms import SE3, translation_error_mm
 from s2p3 import objects
+from s2p3.board import board_spec
 from s2p3.lab.operator import contacts
 from s2p3.lab.rig import BOARD
-from s2p3.lab.scene import board_spec
 from s2p3.lab.truth import sample_truth
 from s2p3.metrics import rotation_error_deg
 

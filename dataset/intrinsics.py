@@ -84,6 +84,18 @@ class Intrinsics:
         matrix[:2] /= level
         return Intrinsics(matrix, self.distortion, self.height // level, self.width // level)
 
+    @property
+    def surrounded(self) -> Intrinsics:
+        """The same camera with a margin of its own size on every side, (3H, 3W): what is drawn there lies
+        outside the image; see `middle`."""
+        shift = np.array([[0, 0, self.width], [0, 0, self.height], [0, 0, 0]])
+        return Intrinsics(self.K + shift, self.distortion, 3 * self.height, 3 * self.width)
+
+    @property
+    def middle(self) -> tuple[slice, slice]:
+        """Rows and columns of the image in one of `surrounded`."""
+        return slice(self.height, 2 * self.height), slice(self.width, 2 * self.width)
+
     def crop(self, box_xywh: ArrayLike, size: tuple[int, int] | int) -> Intrinsics:
         """The grid of a box cut out and resized.
 

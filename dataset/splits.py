@@ -12,10 +12,14 @@ from scipy.spatial import cKDTree
 
 from dataset.errors import SessionError, ToolkitError
 from dataset.session import Session, write_split
+from dataset.symmetry import Symmetry
 from dataset.transforms import SE3
 
 Indices = NDArray[np.int64]
 
+_ASKEW = np.array([0.36, 0.48, 0.8])  # a direction that is no axis of any usual symmetry
+_TURNS = 180
+"""About an axis of symmetry that stand for all, 2 degrees apart (our choice)."""
 _CELLS = 64
 """Patches the view sphere is cut into, about 25 degrees wide (our choice)."""
 
@@ -43,7 +47,11 @@ def by_frame(count: int, fractions: Mapping[str, float], seed: int) -> dict[str,
 
 
 def by_view(
-    T_cam_obj: SE3, fractions: Mapping[str, float], seed: int, separation_deg: float = 5.0
+    T_cam_obj: SE3,
+    fractions: Mapping[str, float],
+    seed: int,
+    separation_deg: float = 5.0,
+    symmetry: Symmetry | None = None,
 ) -> dict[str, Indices]:
     """Divides frames by where they look from, so that no near-duplicate straddles two splits.
 
@@ -56,6 +64,7 @@ def by_view(
         fractions: share of each split by name, before guard bands; they sum to 1.
         seed: same seed, same split.
         separation_deg: smallest angle between views of different splits, degrees.
+        symmetry: of the object: views from which it looks alike are one view.
 
     Returns:
         Increasing frame indices by name.
@@ -65,8 +74,9 @@ def by_view(
     """
     _check(fractions, seed)
     known = np.flatnonzero(T_cam_obj.finite)
-    views = T_cam_obj[known].inverse().translation
-    views = views / np.linalg.norm(views, axis=-1, keepdims=True)
+    alike = _alike(T_cam_obj[known], symmetry or Symmetry())
+    first = np.argmax(alike @ _ASKEW, axis=1)  # one view stands for all that are alike
+    views = alike[np.arange(len(alike)), first]
     rng = np.random.default_rng(seed)
     cells = cKDTree(_fibonacci_sphere(_CELLS)).query(views)[1] if len(views) else np.zeros(0, dtype=int)
     owner = _deal_cells(cells, fractions, rng)
@@ -79,8 +89,8 @@ def by_view(
         if len(taken) and len(mine):
             mine = mine[cKDTree(taken).query(views[mine])[0] > chord]
         found[name] = known[mine].astype(np.int64)
-        taken = np.concatenate([taken, views[mine]])
-    hint = f"{len(known)} posed frames cover too few directions"
+        taken = np.concatenate([taken, alike[mine].reshape(-1, 3)])
+    hint = f"{len(known)} posed frames cover too few directions from which the object looks different"
     return _not_empty({name: found[name] for name in fractions}, fractions, hint)
 
 
@@ -107,10 +117,19 @@ def split_session(
         elif not session.annotated:
             raise SessionError(f"{path} has no annotated object, so no views; run: s2p3 annotate {path}")
         else:
-            found = by_view(session.object_poses(session.annotated[0]).T_cam_obj, fractions, seed)
+            name = session.annotated[0]
+            symmetry = Symmetry.from_json(session.object(name).symmetry)
+            found = by_view(session.object_poses(name).T_cam_obj, fractions, seed, symmetry=symmetry)
     for name, indices in found.items():
         write_split(path, name, indices)
     return found
+
+
+def _alike(T_cam_obj: SE3, symmetry: Symmetry) -> NDArray[np.float64]:
+    """(N, M, 3) unit directions from which the object looks as it does in each of N poses."""
+    eyes = T_cam_obj.inverse().translation
+    found = np.stack([motion.apply(eyes) for motion in SE3.from_matrix(symmetry.sampled(_TURNS))], axis=1)
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)
 
 
 def _deal_cells(cells: Indices, fractions: Mapping[str, float], rng: np.random.Generator) -> NDArray[np.str_]:

@@ -53,13 +53,19 @@ def cached_stokes(path: str | Path, on_progress: Progress = lambda done, total: 
 
 def cache_path(session: Session) -> Path:
     """Where the array of a session is or would be."""
+    return session.path.with_name(f".{session.path.name}.stokes-{images_hash(session)[:16]}.npy")
+
+
+def images_hash(session: Session) -> str:
+    """A hash of all that the undistorted Stokes images of a session depend on: its frames' checksums, its
+    camera and that one's calibration, and how they are decoded."""
     digest = hashlib.sha256(f"{_VERSION} {session.session_id} {astuple(session.camera)}".encode())
     digest.update(session.contents.read("camera/crc32", slice(len(session))).tobytes())
     camera, response = session.intrinsics, session.polarizer_response
     parts: list[NDArray[Any]] = [] if camera is None else [camera.K, camera.distortion]
     for part in parts if response is None else [*parts, response.analysis]:
         digest.update(part.tobytes() + b"|")
-    return session.path.with_name(f".{session.path.name}.stokes-{digest.hexdigest()[:16]}.npy")
+    return digest.hexdigest()
 
 
 def _shape(session: Session) -> tuple[int, int, int, int]:

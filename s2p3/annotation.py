@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration import Calibration, camera_poses
-from dataset import SE3, CalibrationError, Intrinsics
+from dataset import SE3, CalibrationError
 from dataset.errors import ToolkitWarning
 from dataset.session import (
     ObjectPoses,
@@ -107,24 +107,21 @@ def render_poses(
     known.
     """
     camera = session.working_intrinsics
-    height, width = camera.height, camera.width
-    # Drawn on a canvas with the image in its middle: what falls outside the image counts for visibility.
-    shift = np.array([[0, 0, width], [0, 0, height], [0, 0, 0]])
-    canvas = Intrinsics(camera.K + shift, camera.distortion, 3 * height, 3 * width)
+    size, canvas = (camera.height, camera.width), camera.surrounded
     count = len(session)
-    masks = [np.packbits(np.zeros((height, width), dtype=bool))] * count
+    masks = [np.packbits(np.zeros(size, dtype=bool))] * count
     boxes = np.zeros((count, 4))
     visible = np.zeros(count)
     for index in range(count):
         if np.isfinite(T_cam_obj.translation[index]).all():
             pose = T_cam_obj[index]
             raster = rasterize(mesh, pose, canvas, projected_region(mesh, pose, canvas))
-            drawn = np.zeros((3 * height, 3 * width), dtype=bool)
+            drawn = np.zeros((canvas.height, canvas.width), dtype=bool)
             drawn[raster.window] = raster.mask
-            mask = drawn[height : 2 * height, width : 2 * width]
+            mask = drawn[camera.middle]
             masks[index] = np.packbits(mask)
             boxes[index] = mask_box(mask)
             visible[index] = mask.sum() / max(raster.mask.sum(), 1)
         if on_progress is not None:
             on_progress(index + 1, count)
-    return ObjectPoses(T_cam_obj, visible, boxes, PackedMasks(masks, (height, width)))
+    return ObjectPoses(T_cam_obj, visible, boxes, PackedMasks(masks, size))

@@ -6,6 +6,7 @@ out of range, whether it comes from a file, an option or code.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -350,6 +351,13 @@ class ExperimentConfig:
                 f"input.size {self.input.size} does not fit network.total_stride "
                 f"{self.network.total_stride}; "
                 f"use {' or '.join(map(str, sizes))}"
+            )
+        smallest = math.ceil(self.input.size * self.input.canonical_zoom / self.input.zoom)
+        if self.input.canonical_size < smallest:
+            raise ToolkitError(
+                f"input.size {self.input.size} would be enlarged from fewer pixels: input.canonical_size "
+                f"{self.input.canonical_size} covers {self.input.canonical_zoom:g} boxes, the input "
+                f"{self.input.zoom:g}; set input.canonical_size to {smallest} or more"
             )
         if self.augmentation.zoom_max > self.input.canonical_zoom:
             raise ToolkitError(

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -77,9 +78,14 @@ def square_box(box_xywh: ArrayLike, zoom: float = 1.0) -> NDArray[np.float64]:
     return np.array([x + (w - side) / 2, y + (h - side) / 2, side, side])
 
 
-def extract_crop(image: NDArray[np.float32], box_xywh: ArrayLike, size: int) -> NDArray[np.float32]:
-    """Cuts a box out of `image` (C, H, W) and resizes it to (C, size, size), anti-aliased; the border is
-    repeated outside.
+def extract_crop(
+    image: NDArray[np.float32],
+    box_xywh: ArrayLike,
+    size: int,
+    outside: Literal["repeated", "zeros"] = "repeated",
+) -> NDArray[np.float32]:
+    """Cuts a box out of `image` (C, H, W) and resizes it to (C, size, size), anti-aliased; outside there is
+    the border again, or nothing.
 
     Pixel grid: that of `Intrinsics.crop(box_xywh, size)`.
     """
@@ -92,7 +98,7 @@ def extract_crop(image: NDArray[np.float32], box_xywh: ArrayLike, size: int) -> 
         matrix,
         (fine, fine),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
+        borderMode=cv2.BORDER_REPLICATE if outside == "repeated" else cv2.BORDER_CONSTANT,
     )
     crop = cv2.resize(crop, (size, size), interpolation=cv2.INTER_AREA) if samples > 1 else crop
     return np.ascontiguousarray(np.moveaxis(crop.reshape(size, size, -1), -1, 0))

@@ -24,7 +24,8 @@ import numpy as np
 
 from acquisition import typed_toml
 from dataset import SE3, ToolkitError
-from s2p3.symmetry import LARGEST_GROUP, Symmetry, closed
+from dataset.symmetry import Symmetry
+from s2p3.symmetry import LARGEST_GROUP, closed
 
 Kind = Literal["plastic", "metal", "glass"]
 
@@ -76,12 +77,10 @@ class Material:
     symmetry: SymmetryTable = SymmetryTable()
 
     def __post_init__(self) -> None:
-        if not 1.0 < self.refractive_index < 10.0 and not (
-            self.kind == "metal" and self.refractive_index > 0
-        ):
+        if not 1.0 < self.refractive_index < 10.0:
             raise ToolkitError(
-                f"refractive_index = {self.refractive_index:g} is not that of a {self.kind} in air; "
-                "give a number above 1"
+                f"refractive_index = {self.refractive_index:g} is out of range; give a number above 1 and "
+                "below 10: priors and L_physics follow from that, metals with less, as gold, are not modelled"
             )
         if self.extinction < 0 or (self.extinction > 0 and self.kind != "metal"):
             raise ToolkitError(

@@ -20,10 +20,11 @@ from dataset import SE3, ToolkitError
 from dataset.errors import ToolkitWarning
 from dataset.meshes import diameter, load_mesh
 from dataset.session import ObjectPoses, ObjectRecord, Session
+from dataset.symmetry import Symmetry
 from s2p3 import object_meshes
 from s2p3.materials import Kind, Material, load_material
 from s2p3.rendering.mesh import Mesh
-from s2p3.symmetry import Proposal, Symmetry, holds, propose
+from s2p3.symmetry import Proposal, as_toml, holds, propose
 
 if TYPE_CHECKING:
     pass
@@ -219,7 +220,7 @@ def poses_of(session: Session, model: ObjectModel) -> ObjectPoses:
     if not model.symmetry.covers(symmetry):
         raise ToolkitError(
             f"{session.path}: its {model.name!r} has a symmetry that the mesh given lacks; write it into the "
-            f"material file beside the mesh: {' '.join(symmetry.toml.splitlines())}"
+            f"material file beside the mesh: {' '.join(as_toml(symmetry).splitlines())}"
         )
     if abs(record.refractive_index - model.refractive_index) > SAME_INDEX:
         warnings.warn(

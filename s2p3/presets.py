@@ -32,7 +32,7 @@ def paper() -> ExperimentConfig:
         dense_weight=0.0,
     )
     return ExperimentConfig(
-        input=InputConfig(size=256, canonical_size=256, background="mask"),
+        input=InputConfig(size=256, canonical_size=348, background="mask"),
         network=NetworkConfig(total_stride=32),
         teacher=pretraining,
         student=pretraining,

@@ -59,9 +59,7 @@ def check_masks(path: str | Path) -> Iterator[Problem]:
 
 def _check_object(session: Session, name: str) -> Iterator[Problem]:
     record, poses, camera = session.object(name), session.object_poses(name), session.working_intrinsics
-    height, width = camera.height, camera.width
-    shift = np.array([[0, 0, width], [0, 0, height], [0, 0, 0]])
-    canvas = Intrinsics(camera.K + shift, camera.distortion, 3 * height, 3 * width)
+    canvas = camera.surrounded
     draw, hint = Silhouettes(), "annotate the session again"
     for index in range(len(session)):
         where = f"poses/objects/{name}/mask[{index}]"
@@ -74,7 +72,7 @@ def _check_object(session: Session, name: str) -> Iterator[Problem]:
                 yield Problem(where, "shows the object where its pose is unknown", hint)
             continue
         whole = draw(record, poses.T_cam_obj[index], canvas)
-        inside = whole[height : 2 * height, width : 2 * width]
+        inside = whole[camera.middle]
         if whole.sum() < _SMALLEST:
             continue
         common, expected = int((mask & inside).sum()), float(poses.visible_fraction[index] * whole.sum())

@@ -1,18 +1,17 @@
-"""Rigid motions that leave an object looking the same: declared by its user, proposed from its mesh."""
+"""Symmetries of an object: proposed from its mesh, declared in a material file, closed to a group."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
-from dataset import SE3, ToolkitError
+from dataset import SE3
+from dataset.symmetry import SAME_AXIS, SAME_TURN, Symmetry
 
 Array = NDArray[np.float64]
 
@@ -25,84 +24,6 @@ _PROBES = 1_500
 _MOST_CANDIDATES = 40
 LARGEST_GROUP = 60
 """Motions, the identity among them: those of a dodecahedron."""
-
-_SAME_AXIS = np.cos(np.radians(4.0))
-_SAME_TURN = 0.1  # of rotation matrices' entries
-
-
-@dataclass(frozen=True, eq=False)
-class Symmetry:
-    """Rigid motions that leave an object looking the same; none by default.
-
-    Attributes:
-        transforms: (n, 4, 4) float64, object <- object, the identity not listed.
-        axis: (3,) unit direction through the origin about which any rotation is a symmetry, or None.
-    """
-
-    transforms: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    axis: Array | None = None
-
-    @property
-    def any(self) -> bool:
-        """Whether the object has a symmetry: its metric is then ADD-S, otherwise ADD."""
-        return self.axis is not None or len(self.transforms) > 0
-
-    def sampled(self, steps: int = 72) -> Array:
-        """The symmetries as a finite list (m, 4, 4), the identity first; the continuous axis in `steps`."""
-        discrete = np.concatenate([np.eye(4)[None], self.transforms])
-        if self.axis is None:
-            return discrete
-        turns = 2 * np.pi * np.arange(steps) / steps
-        around = SE3.from_rotvec(turns[:, None] * self.axis, np.zeros((steps, 3))).as_matrix()
-        return (around[:, None] @ discrete[None]).reshape(-1, 4, 4)
-
-    def covers(self, other: Symmetry) -> bool:
-        """Whether every rotation that `other` allows is one of these, nearly."""
-        if other.axis is not None and (self.axis is None or abs(self.axis @ other.axis) < _SAME_AXIS):
-            return False
-        own = self.sampled()[:, :3, :3]
-        return all(
-            np.abs(own - motion[:3, :3]).max(axis=(1, 2)).min() < _SAME_TURN for motion in other.transforms
-        )
-
-    @property
-    def toml(self) -> str:
-        """The table of a material file that declares it."""
-        turns = [SE3.from_matrix(motion) for motion in self.transforms]
-        return _table(None if self.axis is None else _rounded(self.axis), _named(turns))
-
-    def to_json(self) -> str:
-        """The two keys of the BOP challenge's models_info.json, in metres."""
-        continuous = [] if self.axis is None else [{"axis": self.axis.tolist(), "offset": [0.0, 0.0, 0.0]}]
-        discrete = [matrix.ravel().tolist() for matrix in self.transforms]
-        return json.dumps({"symmetries_discrete": discrete, "symmetries_continuous": continuous})
-
-    @staticmethod
-    def from_json(text: str) -> Symmetry:
-        """Inverse of `to_json`; an empty text means no symmetry.
-
-        Raises:
-            ToolkitError: not such a JSON text; several axes, or one beside the origin.
-        """
-        try:
-            data: dict[str, Any] = json.loads(text) if text else {}
-            discrete = np.array(data.get("symmetries_discrete", []), dtype=np.float64).reshape(-1, 4, 4)
-            continuous = data.get("symmetries_continuous", [])
-            axis = np.array(continuous[0]["axis"], dtype=np.float64) if continuous else None
-            centred = not any(
-                np.any(np.cross(one["axis"], one.get("offset", np.zeros(3)))) for one in continuous
-            )
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ToolkitError(
-                f"object symmetry: cannot read {text[:60]!r} ({error}); expected JSON with "
-                "symmetries_discrete (16 numbers each) and symmetries_continuous (axis, offset)"
-            ) from error
-        if len(continuous) > 1 or not centred:
-            raise ToolkitError(
-                "object symmetry: one axis at most, through the mesh's origin, can be used; move the origin, "
-                "or declare single turns"
-            )
-        return Symmetry(discrete, axis if axis is None else axis / np.linalg.norm(axis))
 
 
 @dataclass(frozen=True)
@@ -174,9 +95,15 @@ def propose(surface: tuple[Array, Array], vertices: Array, diameter: float) -> P
             worst = max(worst, found)
             offset = max(offset, float(np.linalg.norm(centre - (centre @ axis) * axis)))
     if revolution is not None:
-        upended = [turn for turn in turns if (turn.rotation @ revolution) @ revolution < -_SAME_AXIS][:1]
+        upended = [turn for turn in turns if (turn.rotation @ revolution) @ revolution < -SAME_AXIS][:1]
         return Proposal(_rounded(revolution), _named(upended), worst, offset)
     return Proposal(None, _named(closed(turns)), worst, offset)
+
+
+def as_toml(symmetry: Symmetry) -> str:
+    """The table of a material file that declares it."""
+    axis = None if symmetry.axis is None else _rounded(symmetry.axis)
+    return _table(axis, _named([SE3.from_matrix(motion) for motion in symmetry.transforms]))
 
 
 def holds(symmetry: Symmetry, surface: tuple[Array, Array], diameter: float) -> bool:
@@ -231,12 +158,12 @@ def _candidates(points: Array, vertices: Array) -> list[Array]:
     axes: list[Array] = []
     for axis in np.concatenate([np.eye(3), principal.T, by_area[:400], by_reach[:200]]):
         unit = axis / max(float(np.linalg.norm(axis)), 1e-12)
-        if len(axes) < _MOST_CANDIDATES and all(abs(float(unit @ other)) < _SAME_AXIS for other in axes):
+        if len(axes) < _MOST_CANDIDATES and all(abs(float(unit @ other)) < SAME_AXIS for other in axes):
             axes.append(unit)
     return axes
 
 
-def closed(turns: Sequence[SE3], same: float = _SAME_TURN) -> list[SE3]:
+def closed(turns: Sequence[SE3], same: float = SAME_TURN) -> list[SE3]:
     """Every product of some rotations but the identity, theirs first: with two of a cube's turns, all 23.
 
     Stops looking beyond LARGEST_GROUP.

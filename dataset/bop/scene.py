@@ -45,10 +45,7 @@ class Scene:
     ) -> None:
         self.session, self.folder, self.records, self.ids, self.draw = session, folder, records, ids, draw
         self.camera = session.working_intrinsics
-        height, width = self.camera.height, self.camera.width
-        shift = np.array([[0, 0, width], [0, 0, height], [0, 0, 0]])
-        # the image in the middle of a canvas: what lies outside it belongs to the silhouette, too
-        self.canvas = Intrinsics(self.camera.K + shift, self.camera.distortion, 3 * height, 3 * width)
+        self.canvas = self.camera.surrounded  # what lies outside the image belongs to the silhouette, too
         assert session.intrinsics is not None
         self.maps = session.intrinsics.at(SUPERPIXEL[session.camera.mosaic]).undistort_map()
         self.cameras: dict[int, dict[str, Any]] = {}
@@ -79,8 +76,7 @@ class Scene:
             whole = self.draw(record, pose, self.canvas)
             visible = poses.mask(index)
             label = f"{name}_{len(self.truth[index]):06d}.png"
-            height, width = visible.shape
-            inside = whole[height : 2 * height, width : 2 * width]
+            inside = whole[self.camera.middle]
             write_image(self.folder / "mask" / label, 255 * inside.astype(np.uint8))
             write_image(self.folder / "mask_visib" / label, 255 * visible.astype(np.uint8))
             rotation, translation = pose.rotation.ravel().tolist(), (pose.translation * MM).tolist()

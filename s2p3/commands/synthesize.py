@@ -45,7 +45,8 @@ def synthesize(
         material: TOML file of what it is made of; that beside the mesh by default.
         simplify_mm: render a mesh of fewer faces whose surface is nowhere further off than this.
         intrinsics: calibration.json of the camera to imitate; the paper's camera by default.
-        views_like: session whose poses of the object the views are distributed like.
+        views_like: session whose poses of the object the views are distributed like; those of its split
+            train, where it has one.
         domain: synthetic to train on; plain varies less; captured has a denser material, harder light, more
             noise, occlusion.
         seed: the same seed, the same frames.

@@ -132,9 +132,18 @@ class Scene:
 
     @property
     def visible_fraction(self) -> float:
-        """Visible share of the object's pixels in the image; 0 where it is not in the image."""
-        seen = int(self.layers[0].raster.mask.sum())
-        return float(self.mask.sum()) / seen if seen else 0.0
+        """Share of the object's silhouette that is visible: neither covered nor outside the image."""
+        return float(self.mask.sum()) / max(self._silhouette_px, 1)
+
+    @property
+    def _silhouette_px(self) -> int:
+        """Pixels of the object's silhouette, those outside the image included."""
+        raster, camera = self.layers[0].raster, self.intrinsics
+        rows, columns = raster.window
+        if min(rows.start, columns.start) <= 0 or rows.stop >= camera.height or columns.stop >= camera.width:
+            canvas, mesh = camera.surrounded, self.model.mesh
+            raster = rasterize(mesh, self.T_cam_obj, canvas, projected_region(mesh, self.T_cam_obj, canvas))
+        return int(raster.mask.sum())
 
     @cached_property
     def _owner(self) -> NDArray[np.uint8]:
@@ -170,7 +179,7 @@ class SceneImage:
         stokes: what a noiseless sensor sees, white = 1 per polarizer.
         raster: the object's truth within its block of the image, occluders ignored.
         mask: (h, w) bool, where the object is visible.
-        visible_fraction: visible share of the object's pixels in the image.
+        visible_fraction: share of the object's silhouette that is visible.
     """
 
     stokes: Stokes

@@ -14,6 +14,7 @@ from s2p3.synthesis.scene import SceneParameters
 Image = NDArray[np.float32]
 
 _NOISE_COUNT = 1 << 22
+"""Of deviates at least; twice as many as an image has pixels, where that is more."""
 
 
 def expose(
@@ -21,11 +22,12 @@ def expose(
 ) -> NDArray[np.uint16]:
     """A raw mosaic (2h, 2w) uint16 of a monochrome polarization sensor: shot and read noise, quantization."""
     intensity = sample_mosaic(stokes, "mono")
-    start = int(rng.integers(_NOISE_COUNT - intensity.size))
+    noise = _noise(max(_NOISE_COUNT, 1 << (2 * intensity.size - 1).bit_length()))
+    start = int(rng.integers(len(noise) - intensity.size))
     out = np.empty(intensity.shape, np.uint16)
     _read_out(
         intensity.ravel(),
-        _noise()[start : start + intensity.size],
+        noise[start : start + intensity.size],
         np.float32(parameters.full_well),
         np.float32(parameters.read_noise**2),
         np.float32(white_level(bits)),
@@ -35,9 +37,9 @@ def expose(
 
 
 @lru_cache(maxsize=1)
-def _noise() -> Image:
+def _noise(count: int) -> Image:
     """A long row of normal deviates; each frame reads it from another place: cheaper than drawing."""
-    return np.random.default_rng(0).standard_normal(_NOISE_COUNT, dtype=np.float32)
+    return np.random.default_rng(0).standard_normal(count, dtype=np.float32)
 
 
 @numba.njit(cache=True)

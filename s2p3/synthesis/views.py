@@ -70,13 +70,16 @@ class ViewsLike:
 
     @staticmethod
     def of(path: str | Path, name: str) -> ViewsLike:
-        """The views of a recorded session.
+        """The views of a recorded session: those of its split train where it has one, so that the views it is
+        tested on stay unknown.
 
         Raises:
             ToolkitError: no such session, or it knows no pose of the object.
         """
         with Session.open(path) as session:
             poses = session.object_poses(name).T_cam_obj.as_matrix()[:, :3].reshape(-1, 12)
+            if "train" in session.splits:
+                poses = poses[session.frames_in("train")]
         known = poses[np.isfinite(poses).all(axis=1)]
         if len(known) == 0:
             raise ToolkitError(f"{path}: no frame knows the pose of {name}; run: s2p3 annotate {path}")

@@ -85,7 +85,7 @@ def form_input(
     seen = inputs.network_input(stokes, window.K, refractive_index, config.input, mask, depth)
     valid = seen.valid
     if crops.valid is not None:
-        valid = window.resample(crops.valid[indices].float()) > _WHOLLY
+        valid = window.resample(crops.valid[indices].float(), padding="zeros") > _WHOLLY
     return replace(seen, stokes=measured, valid=valid)
 
 

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 from acquisition import typed_toml
 from dataset.errors import ToolkitError
+from dataset.symmetry import Symmetry
 from s2p3.config import ExperimentConfig
 from s2p3.objects import SAME_INDEX, SAME_SIZE, ObjectModel
 from s2p3.provenance import toolkit_state
-from s2p3.symmetry import Symmetry
 from s2p3.training.ranks import have_met, is_first
 from s2p3.writable import check_folder
 

@@ -25,6 +25,7 @@ from torch import Tensor
 from dataset import SE3, Intrinsics
 from dataset.errors import ToolkitError
 from dataset.session import Session, mask_box
+from dataset.stokes_cache import images_hash
 from s2p3.config import InputConfig
 from s2p3.inputs import crop_intrinsics, extract_crop, extract_depth, square_box
 from s2p3.networks.detector import Detection
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 _ASKEW = np.array([0.36, 0.48, 0.8])  # a direction that is no axis of any usual symmetry
-_KEPT = 2  # which tensors a file of crops holds: one that holds others is not read, but made anew
+_KEPT = 3  # which tensors a file of crops holds: one that holds others is not read, but made anew
 _MINIMUM_VISIBLE = 0.3  # our choice: frames that show less of the object than this are not trained on
 
 
@@ -90,20 +91,19 @@ class LabelledCrops(Crops):
 
 
 def content_hashes(paths: Sequence[Path], model: ObjectModel) -> dict[str, str]:
-    """What trainings on sessions depend on, by session id: short hashes of the images' checksums, the
-    calibration, the object's poses and how it is seen.
+    """What trainings on sessions depend on, by session id: short hashes of the images and their calibration,
+    of depth, and of the object's poses and how it is seen.
 
     Raises ToolkitError: a session is given twice; see also `poses_of`.
     """
     hashes: dict[str, str] = {}
     for path in paths:
         with Session.open(path) as session:
-            digest = hashlib.sha256(session.contents.read("camera/crc32", slice(len(session))).tobytes())
+            digest = hashlib.sha256(images_hash(session).encode())
             if session.has_depth:
                 digest.update(session.contents.read("depth_crc32", slice(len(session))).tobytes())
-            camera, poses = session.working_intrinsics, poses_of(session, model)
-            views = (poses.T_cam_obj.as_matrix(), poses.bbox_xywh, poses.visible_fraction)
-            for part in (camera.K, camera.distortion, *views):
+            poses = poses_of(session, model)
+            for part in (poses.T_cam_obj.as_matrix(), poses.bbox_xywh, poses.visible_fraction):
                 digest.update(np.ascontiguousarray(part).tobytes())
             hashes[once(session, hashes)] = digest.hexdigest()[:16]
     return hashes
@@ -242,7 +242,8 @@ def captured_crops(
         image, camera = np.moveaxis(stokes.stack(), 0, -1), session.working_intrinsics
         row = _crop(image, found.mask, found.box_xywh, camera, config, depth)
         region = square_box(found.box_xywh, config.canonical_zoom)
-        whole = extract_crop(stokes.valid[None].astype(np.float32), region, config.canonical_size)
+        valid = stokes.valid[None].astype(np.float32)
+        whole = extract_crop(valid, region, config.canonical_size, outside="zeros")
         rows.append({**row, "valid": whole > 0.999})
     if not rows:
         raise ToolkitError(
@@ -306,17 +307,17 @@ def _crop(
 ) -> dict[str, NDArray[np.generic]]:
     region = square_box(box, config.canonical_zoom)
     rows, columns = _under(region, mask.shape)
-    part = np.dstack([stokes[rows, columns], mask[rows, columns]]).astype(np.float32)
     local = region - [columns.start, rows.start, 0, 0]
-    crop = extract_crop(np.moveaxis(part, -1, 0), local, config.canonical_size).astype(np.float16)
+    light = np.moveaxis(stokes[rows, columns], -1, 0).astype(np.float32)
+    silhouette = mask[None, rows, columns].astype(np.float32)
     measured = {}
     if depth is not None:
         near = extract_depth(depth[rows, columns], local, config.canonical_size)
         measured["depth"] = near[None].astype(np.float16)
     return {
         **measured,
-        "stokes": crop[:3],
-        "mask": crop[3:],
+        "stokes": extract_crop(light, local, config.canonical_size).astype(np.float16),
+        "mask": extract_crop(silhouette, local, config.canonical_size, outside="zeros").astype(np.float16),
         "K": crop_intrinsics(intrinsics, region, config.canonical_size),
     }
 

@@ -167,7 +167,7 @@ class MaskScorer:
             fine = F.interpolate(logits.cpu(), scale_factor=float(CELL), mode="bilinear")
             found, true = fine[..., : masks.shape[2], : masks.shape[3]] > 0, masks > 0.5
             both, either = (found & true).sum((1, 2, 3)), (found | true).sum((1, 2, 3))
-            shares.append(both / either.clamp_min(1))
+            shares.append(torch.where(either > 0, both / either.clamp_min(1), 1.0))  # nothing, and rightly so
         return 100 * float(torch.cat(shares).mean())
 
 

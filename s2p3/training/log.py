@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from pathlib import Path
 from types import TracebackType
@@ -61,8 +62,16 @@ class RunLog:
                 "install it with: pip install 's2p3[train]'"
             ) from error
         lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else []
-        kept = [line for line in lines if json.loads(line)["step"] <= self.first]
+        kept = [line for line in lines if _step_of(line) <= self.first]
         self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
         if not self.first:
             shutil.rmtree(self.events, ignore_errors=True)
         return SummaryWriter(str(self.events), purge_step=self.first + 1 if self.first else None)
+
+
+def _step_of(line: str) -> float:
+    """The step of a line; after all others where it was cut short."""
+    try:
+        return float(json.loads(line)["step"])
+    except ValueError:
+        return math.inf

@@ -58,12 +58,18 @@ def self_supervise(
         settings: weights and schedule; by default those the student's experiment holds.
         workers, report: see `loop.Run`.
 
-    Raises ToolkitError: checkpoints of another object or of different inputs; a depth loss without depth; a
-        teacher that is to follow a student of another architecture; see also `loop.optimize`.
+    Raises ToolkitError: checkpoints of another object or of different inputs; a depth loss without depth, or
+        one on polarization that the networks do not see; a teacher that is to follow a student of another
+        architecture; see also `loop.optimize`.
     """
     path = checkpoint.to_write(out / "adapted.safetensors")
     pair = load_pair(teacher, student, model)
     settings = settings or pair.config.self_supervision
+    if settings.physics != "none" and pair.config.input.modality != "polarization":
+        raise ToolkitError(
+            f'self_supervision.physics = "{settings.physics}" teaches by polarization, which {student} does '
+            'not see; set physics = "none", or train with the method self6d'
+        )
     if settings.depth != "none" and crops.depth is None:
         raise ToolkitError(
             f'self_supervision.depth = "{settings.depth}" needs depth, and the session has none; '
@@ -76,7 +82,9 @@ def self_supervise(
             adapt_batch_norm(pair.teacher, crops, model.refractive_index, pair.config, settings)
     mesh = RenderMesh.from_mesh(model.mesh)
     labels = make_labels(pair.teacher, crops, model, mesh, pair.config)
-    report_signal(captured_signal(crops, labels.rotation, labels.translation, model), path, settings.physics)
+    if pair.config.input.modality == "polarization":
+        signal = captured_signal(crops, labels.rotation, labels.translation, model)
+        report_signal(signal, path, settings.physics)
     if settings.freeze_norms:
         freeze_norms(pair.student)
     set_momentum(pair.student, _BATCH_NORM_MOMENTUM)

@@ -10,6 +10,7 @@ import pytest
 from dataset import SE3, ToolkitError
 from dataset.session import Session
 from dataset.splits import by_frame, by_view, split_session
+from dataset.symmetry import Symmetry
 
 FRACTIONS = {"train": 0.7, "val": 0.1, "test": 0.2}
 
@@ -95,3 +96,19 @@ def test_an_empty_split_is_refused() -> None:
         by_frame(3, {"train": 0.9, "val": 0.1}, 0)
     with pytest.raises(ToolkitError, match="would be empty"):
         by_view(hemisphere(1), FRACTIONS, 0)
+
+
+def test_views_from_which_an_object_looks_alike_are_one_view() -> None:
+    """A bottle looks the same from all around, a box the same from behind."""
+    half_turn = SE3.from_rotvec([0, 0, np.pi], np.zeros(3)).as_matrix()
+    box, bottle = Symmetry(transforms=half_turn[None]), Symmetry(axis=np.array([0.0, 0.0, 1.0]))
+    poses = hemisphere(3000, seed=2)
+    views = poses.inverse().translation
+    views = views / np.linalg.norm(views, axis=-1, keepdims=True)
+    found = by_view(poses, {"train": 0.5, "test": 0.5}, 0, symmetry=box)
+    train, test = views[found["train"]], views[found["test"]]
+    for turned in (train, train * [-1, -1, 1]):
+        assert np.rad2deg(np.arccos((turned @ test.T).max())) > 5.0
+    found = by_view(poses, {"train": 0.5, "test": 0.5}, 0, symmetry=bottle)
+    heights = [np.rad2deg(np.arccos(views[found[name], 2])) for name in ("train", "test")]
+    assert np.abs(heights[0][:, None] - heights[1]).min() > 4.85  # turns stand for all, 2 degrees apart

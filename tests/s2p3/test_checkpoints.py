@@ -15,11 +15,11 @@ import torch
 from safetensors.torch import load_file
 
 from dataset.errors import ToolkitError
+from dataset.symmetry import Symmetry
 from s2p3 import objects, presets
 from s2p3.config import FrameSource
 from s2p3.evaluation import Estimator
 from s2p3.objects import ObjectModel
-from s2p3.symmetry import Symmetry
 from s2p3.training import checkpoint, labelled_crops, supervise, train_detector
 from s2p3.training.supervised import load_student, load_teacher
 from tests.s2p3.untrained import save_untrained

@@ -139,3 +139,12 @@ def test_the_ends_of_a_range_are_in_it() -> None:
     dataclasses.replace(base.detector, level=32, threshold=0.0, minimum_score=1.0)
     dataclasses.replace(base.augmentation, zoom_min=1.6, shift=0.0, rotation_deg=180.0, blur=1.0, gain=0.0)
     dataclasses.replace(base.input, zoom=1.9, canonical_size=32)
+
+
+def test_an_input_is_not_enlarged_from_fewer_pixels(tmp_path: Path) -> None:
+    for preset in presets.PRESETS.values():
+        seen = preset().input
+        assert seen.canonical_size * seen.zoom / seen.canonical_zoom >= seen.size
+    (tmp_path / "large.toml").write_text("[input]\nsize = 128\n")
+    with pytest.raises(ToolkitError, match=r"canonical_size 96 covers 1\.9 boxes.* set .* to 174 or more"):
+        config.load(tmp_path / "large.toml")

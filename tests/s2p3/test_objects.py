@@ -181,6 +181,7 @@ def test_a_material_file_beside_the_mesh_is_read(tmp_path: Path) -> None:
     [
         ("kind = 'wood'", "plastic.*metal.*glass"),
         ("refractive_index = 0.9", "above 1"),
+        ('kind = "metal"\nrefractive_index = 0.2', "metals with less, as gold, are not modelled"),
         ("extinction = 2.0", "metals"),
         ("colour = [2.0, 0, 0]", "0 to 1"),
         ("roughness = 0.0", "roughness"),

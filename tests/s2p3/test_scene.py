@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from calibration import Calibration, IntrinsicsRecord
-from dataset import Intrinsics, ToolkitError
+from dataset import SE3, Intrinsics, ToolkitError
 from dataset.frames import Mosaic
-from dataset.polarimetry import decode
+from dataset.polarimetry import Stokes, decode
 from dataset.session import Session
 from s2p3 import objects
 from s2p3.objects import ObjectModel
@@ -214,3 +214,25 @@ def test_the_default_camera_is_the_published_one() -> None:
     camera = session_camera()
     assert (camera.height, camera.width) == (512, 612)
     assert camera.K[0, 0] == 351.450
+
+
+def test_what_the_images_edge_cuts_off_is_not_visible() -> None:
+    camera = Intrinsics(SMALL.K, np.zeros(0), SMALL.height, SMALL.width)
+    rng = np.random.default_rng(0)
+    T_cam_obj = SYNTHETIC.views.draw(CUP, camera, rng)
+    bare = replace(draw_scene(SYNTHETIC, CUP, T_cam_obj, rng), clutter=())
+    middle, cut = (
+        Scene(CUP, SE3(T_cam_obj.rotation, np.array([x, 0.0, 0.5])), camera, bare) for x in (0.0, -0.33)
+    )
+    assert middle.visible_fraction == 1
+    whole = rasterize(CUP.mesh, cut.T_cam_obj, camera.surrounded).mask
+    assert cut.mask.sum() == whole[camera.middle].sum()
+    assert 0.1 < cut.visible_fraction == cut.mask.sum() / whole.sum() < 0.9
+
+
+def test_a_monochrome_sensor_of_five_megapixels_is_read_out() -> None:
+    size = (1024, 1224)
+    light = Stokes(np.full(size, 0.5, np.float32), *np.zeros((2, *size), np.float32), np.ones(size, bool))
+    raw = expose(light, _scene(0)[0].parameters, 12, np.random.default_rng(0))
+    assert raw.shape == (2048, 2448)
+    assert raw.std() > 0

@@ -299,6 +299,10 @@ def test_the_baseline_refuses_polarization_and_missing_depth(
     networks = (baseline["teacher"], baseline["student"])
     with pytest.raises(ToolkitError, match="the session has none"):
         self_supervise_rgbd(crops_of(cup_session, tiny("rgb")), cup, *networks, tmp_path)
+    with pytest.raises(
+        ToolkitError, match=r'teaches by polarization, which .* does not see; set physics = "none"'
+    ):
+        self_supervise(crops_of(with_depth, tiny("rgb")), cup, *networks, tmp_path)
     with pytest.raises(ToolkitError, match=r"sees polarization.*input.modality"):
         self_supervise_rgbd(crops_of(with_depth, tiny()), cup, direct["teacher"], direct["student"], tmp_path)
 
@@ -414,3 +418,14 @@ def test_networks_that_see_depth_want_it(cup_session: Path, with_depth: Path, cu
     with h5py.File(with_depth) as file:
         assert "depth" in file
     assert labelled_crops([with_depth], cup, config.input).depth is not None
+
+
+def test_networks_without_polarization_are_not_judged_by_it(
+    baseline: dict[str, Path], cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    config = tiny("rgb")
+    settings = dataclasses.replace(config.self_supervision, physics="none")
+    pair = (baseline["teacher"], baseline["student"])
+    adapted = self_supervise(crops_of(cup_session, config), cup, *pair, tmp_path, settings)
+    assert adapted.exists()
+    assert not adapted.with_suffix(".signal.json").exists()

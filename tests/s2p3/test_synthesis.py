@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from dataset import Intrinsics, ToolkitError
-from dataset.session import Session
+from dataset.session import Session, write_split
 from s2p3 import objects
 from s2p3.synthesis import (
     SYNTHETIC,
@@ -232,6 +232,8 @@ def test_views_like_a_sessions_are_distributed_as_its_are(tmp_path: Path) -> Non
     np.testing.assert_array_equal(render_again(tmp_path / "like.h5", 0)[1], _raws(tmp_path / "like.h5")[0])
     with pytest.raises(ToolkitError):
         ViewsLike.of(tmp_path / "seen.h5", "fork")
+    write_split(tmp_path / "seen.h5", "train", [3, 5])
+    assert ViewsLike.of(tmp_path / "seen.h5", "cup").poses == (like.poses[3], like.poses[5])
 
 
 def test_analytic_is_what_a_set_is_rendered_with_unless_told(tmp_path: Path) -> None:

@@ -21,16 +21,18 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import load_file
 
-from dataset import SE3
+from dataset import SE3, Intrinsics
 from dataset.errors import ToolkitError
-from dataset.session import Session, mask_box, write_split
+from dataset.polarizer_response import PolarizerResponse
+from dataset.session import ObjectPoses, Session, mask_box, write_calibration, write_poses, write_split
+from dataset.symmetry import Symmetry
 from s2p3 import config, presets
 from s2p3.config import AugmentationConfig, ExperimentConfig, FrameSource
-from s2p3.inputs import View
-from s2p3.networks.detector import Detection
+from s2p3.inputs import View, square_box
+from s2p3.networks.detector import CELL, Detection
 from s2p3.networks.pose_head import ray_rotation, site_from_translation
 from s2p3.networks.teacher import Teacher
-from s2p3.objects import ObjectModel, Symmetry, build
+from s2p3.objects import ObjectModel, build
 from s2p3.provenance import toolkit_state
 from s2p3.rendering.differentiable import RenderMesh
 from s2p3.training import (
@@ -45,8 +47,9 @@ from s2p3.training import (
 )
 from s2p3.training.batches import form_input, form_targets
 from s2p3.training.crops import canonical_pose, content_hashes
-from s2p3.training.detection import box_distances, detector_losses
+from s2p3.training.detection import MaskScorer, SmallFrames, box_distances, detector_losses
 from s2p3.training.examples import Examples, divide
+from s2p3.training.log import RunLog
 from s2p3.training.pseudo_labels import make_labels, warp_labels
 from s2p3.training.scoring import PoseScorer
 from s2p3.training.supervised import ALL_FRAMES, load_student, load_teacher
@@ -378,3 +381,64 @@ def test_nothing_detected_is_said_clearly(cup_session: Path) -> None:
 def test_an_object_the_session_lacks_is_said_clearly(cup_session: Path) -> None:
     with pytest.raises(ToolkitError, match="knife"):
         labelled_crops([cup_session], build("knife"), tiny().input)
+
+
+@pytest.mark.parametrize("changed", ["distortion", "response"])
+def test_what_a_new_calibration_changes_in_the_images_changes_their_hash(
+    changed: str, cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    path = Path(shutil.copy(cup_session, tmp_path / "again.h5"))
+    before = content_hashes([path], cup)
+    with Session.open(path) as session:
+        assert session.intrinsics is not None
+        lens, size = session.intrinsics, (session.camera.height, session.camera.width)
+        poses, masks = session.object_poses("cup"), [session.object_poses("cup").mask(i) for i in range(8)]
+    ideal = PolarizerResponse.ideal(*size)
+    response = PolarizerResponse(0.98 * ideal.analysis) if changed == "response" else None
+    if changed == "distortion":
+        lens = Intrinsics(lens.K, np.array([0.1, 0, 0, 0, 0.0]), lens.height, lens.width)
+    write_calibration(path, "{}", lens, response)
+    kept = ObjectPoses(poses.T_cam_obj, poses.visible_fraction, poses.bbox_xywh, masks)
+    write_poses(path, SE3.identity((8,)), 0.0, 0.0, {"cup": kept})
+    assert content_hashes([path], cup) != before
+
+
+def test_outside_the_image_there_is_neither_object_nor_measurement(
+    cup_session: Path, cup: ObjectModel
+) -> None:
+    config = tiny().input
+    with Session.open(cup_session) as session:
+        width = session.camera.working_size[1]
+        mask = np.zeros(session.camera.working_size, bool)
+        mask[40:80, width - 40 :] = True  # cut by the right edge
+        crops = captured_crops(session, [0], [Detection(mask_box(mask), mask, 0.9)], config)
+        _, _, side, _ = square_box(mask_box(mask), config.canonical_zoom)
+    assert crops.valid is not None
+    edge = round(config.canonical_size / 2 + 20 / side * config.canonical_size)  # 20 px right of the centre
+    assert crops.valid[0, 0, :, : edge - 1].all()
+    assert not crops.valid[0, 0, :, edge + 1 :].any()
+    assert not crops.mask[0, 0, :, edge + 1 :].any()
+    assert crops.stokes[0, 0, :, edge + 1 :].all()  # there the light at the edge is repeated
+
+
+def test_seeing_nothing_where_nothing_is_scores_full_marks() -> None:
+    class Silent(torch.nn.Module):
+        def __init__(self, level: float) -> None:
+            super().__init__()
+            self.level = torch.nn.Parameter(torch.tensor(level))
+
+        def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            logits = self.level.expand(len(image), 1, image.shape[2] // CELL, image.shape[3] // CELL)
+            return logits, logits
+
+    empty = SmallFrames(torch.rand(2, 3, 64, 64), torch.zeros(2, 1, 64, 64))
+    assert MaskScorer(empty)(Silent(-1.0)) == 100
+    assert MaskScorer(empty)(Silent(1.0)) == 0
+
+
+def test_a_log_cut_short_in_a_line_does_not_stop_a_training_from_going_on(tmp_path: Path) -> None:
+    log = tmp_path / "student.log.jsonl"
+    log.write_text('{"step": 10, "total": 1.0}\n{"step": 20, "tot')
+    with RunLog(tmp_path / "student.safetensors", 10) as lines:
+        lines.write({"step": 20, "total": 0.5})
+    assert [json.loads(line)["step"] for line in log.read_text().splitlines()] == [10, 20]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -131,6 +132,18 @@ class Study:
         if row in (TEACHER, BEFORE):
             return path, path.stem, getattr(config, path.stem)
         return path, "self_supervision", CHANGES[row](config.self_supervision)
+
+
+def check_sets(study: Study) -> None:
+    """Raises ToolkitError: the folder's sets are another study's. A new folder notes what they will be."""
+    note = study.out / "study.json"
+    wanted = {"domain": study.domain, "traced": study.traced, "analytic": study.analytic}
+    if not note.exists():
+        study.out.mkdir(parents=True, exist_ok=True)
+        note.write_text(json.dumps(wanted) + "\n", encoding="utf-8")
+    held = json.loads(note.read_text(encoding="utf-8"))
+    if held != wanted:
+        raise ToolkitError(f"{study.out} holds a study of {held}, not of {wanted}; choose another --out")
 
 
 def check_settings(study: Study) -> None:

@@ -45,6 +45,7 @@ from plan import (
     TRACED_SEED,
     VALIDATION,
     Study,
+    check_sets,
     check_settings,
 )
 from results import result_of
@@ -175,7 +176,7 @@ def run_all(jobs: Iterable[Job], workers: int) -> None:
 
 def run_study(study: Study, workers: int) -> None:
     """Every step whose file is missing."""
-    study.out.mkdir(parents=True, exist_ok=True)
+    check_sets(study)
     check_settings(study)
     networks: list[Job] = [(study.detector, train_network, (study, "detector", study.seeds[0]))]
     detection: list[Job] = [(study.found(name), find_captured, (study, name)) for name in study.captured]
@@ -210,7 +211,7 @@ def main() -> int:
     options = parser.parse_args()
     study = Study(
         options.object,
-        options.out,
+        options.out / options.object,
         tuple(options.seeds),
         options.domain,
         options.traced,

@@ -72,7 +72,9 @@ def test_workers_make_the_same_batches_from_any_step_on_memory_or_disk(session: 
     for one, other in zip(here[2:], off_disk, strict=True):
         for name, part in named_tensors(other, "").items():
             apart = (part.float() - one[name].float()).abs() > 0.05
-            assert apart.float().mean() < 1e-3, name  # where nothing is polarized, a prior's side is a toss-up
+            assert apart.float().mean() < 1e-3, (
+                name
+            )  # where nothing is polarized, a prior's side is a toss-up
 
 
 def test_a_data_set_travels_without_its_handles(session: Path) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from acquisition.camera import Camera
 from acquisition.clearance import CarriedCamera
+from acquisition.live import ignore
 from acquisition.recorder import (
     NO_CAMERA,
     OnProgress,
@@ -44,7 +45,7 @@ def capture_board(
     kind: Literal["intrinsics", "hand_eye"] = "hand_eye",
     views: int = 24,
     seed: int = 0,
-    on_progress: OnProgress = lambda progress: None,
+    on_progress: OnProgress = ignore,
 ) -> Progress:
     """Stills of the calibration board from diverse directions; serves intrinsics and hand-eye calibration.
 
@@ -65,7 +66,7 @@ def capture_board(
 
 
 def capture_board_motion(
-    rig: Rig, out: Path, *, seconds: float, seed: int = 1, on_progress: OnProgress = lambda progress: None
+    rig: Rig, out: Path, *, seconds: float, seed: int = 1, on_progress: OnProgress = ignore
 ) -> Progress:
     """The board filmed while the arm moves, from which the clock offset of camera and arm is estimated."""
     _refuse_to_overwrite(out)
@@ -84,7 +85,7 @@ def capture_sequence(
     *,
     seconds: float,
     append: bool = False,
-    on_progress: OnProgress = lambda progress: None,
+    on_progress: OnProgress = ignore,
 ) -> Progress:
     """The object filmed from the hemisphere above it, sweep after sweep at changing distance.
 
@@ -111,17 +112,13 @@ def capture_sequence(
         return _film(camera, robot, route, begin, seconds, on_progress)
 
 
-def capture_touches(
-    rig: Rig, out: Path, *, count: int, on_progress: OnProgress = lambda progress: None
-) -> Progress:
+def capture_touches(rig: Rig, out: Path, *, count: int, on_progress: OnProgress = ignore) -> Progress:
     """Points touched on the object with the measuring tip while a hand guides the arm; the toolkit only reads
     it."""
     return _guided(rig, out, "touches", count, on_progress)
 
 
-def capture_tool_tip(
-    rig: Rig, out: Path, *, count: int, on_progress: OnProgress = lambda progress: None
-) -> Progress:
+def capture_tool_tip(rig: Rig, out: Path, *, count: int, on_progress: OnProgress = ignore) -> Progress:
     """The tip kept in one point while a hand tilts the tool, `count` times held still."""
     return _guided(rig, out, "tool_tip", count, on_progress)
 
@@ -132,7 +129,7 @@ def capture_polarizer(
     turns: Iterable[float],
     *,
     frames: int = 1,
-    on_progress: OnProgress = lambda progress: None,
+    on_progress: OnProgress = ignore,
 ) -> Progress:
     """An even lamp behind a linear polarizer that somebody turns; `turns` as in `record_turns`."""
     with open_camera(rig) as camera, _writer(out, "polarizer", camera.info, rig) as writer:

@@ -13,7 +13,6 @@ import io
 import math
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any
@@ -22,15 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataset.errors import SessionError
+from dataset.progress import Progress, silent
 from dataset.session import Session
 
 _VERSION = 1
 """Of the decoding and of this layout: raise it when either changes."""
 
-Progress = Callable[[int, int], None]
 
-
-def cached_stokes(path: str | Path, on_progress: Progress = lambda done, total: None) -> NDArray[np.float16]:
+def cached_stokes(path: str | Path, on_progress: Progress = silent) -> NDArray[np.float16]:
     """(N, h, w, 3) read-only, memory-mapped Stokes images of a session; made on the first call.
 
     Two processes that call it at once both make it, and the second result replaces the first, which is the

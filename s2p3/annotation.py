@@ -8,7 +8,6 @@ and the pose at which the object was touched. Masks and boxes are rendered from 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import numpy as np
 from calibration import Calibration, camera_poses
 from dataset import SE3, CalibrationError
 from dataset.errors import ToolkitWarning
+from dataset.progress import Progress, silent
 from dataset.session import (
     ObjectPoses,
     PackedMasks,
@@ -30,7 +30,6 @@ from s2p3.objects import ObjectModel
 from s2p3.rendering.mesh import Mesh
 from s2p3.rendering.rasterizer import projected_region, rasterize
 
-Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
 
@@ -43,7 +42,7 @@ class Annotation:
 
 
 def annotate(
-    path: Path, calibration: Calibration, model: ObjectModel, on_progress: Progress | None = None
+    path: Path, calibration: Calibration, model: ObjectModel, on_progress: Progress = silent
 ) -> Annotation:
     """Writes camera poses, object poses, boxes and masks into a session, replacing earlier ones. Objects that
     were annotated before are annotated again, with this calibration.
@@ -98,9 +97,7 @@ def annotate(
     return Annotation(len(visible), int((visible > 0).sum()))
 
 
-def render_poses(
-    session: Session, T_cam_obj: SE3, mesh: Mesh, on_progress: Progress | None = None
-) -> ObjectPoses:
+def render_poses(session: Session, T_cam_obj: SE3, mesh: Mesh, on_progress: Progress = silent) -> ObjectPoses:
     """Masks, boxes and visibility of an object at known poses (N) in a session's undistorted image.
 
     The visible fraction is the share of the silhouette inside the image; what occludes the object is not
@@ -122,6 +119,5 @@ def render_poses(
             masks[index] = np.packbits(mask)
             boxes[index] = mask_box(mask)
             visible[index] = mask.sum() / max(raster.mask.sum(), 1)
-        if on_progress is not None:
-            on_progress(index + 1, count)
+        on_progress(index + 1, count)
     return ObjectPoses(T_cam_obj, visible, boxes, PackedMasks(masks, size))

@@ -230,20 +230,22 @@ class Demo:
             synthesize(self.model, count, camera, self.seed, self.synthetic, workers, report, _DOMAIN)
 
     def train(self) -> None:
-        """A process and a thread each: the teacher beside the detector, which the student follows. What is
-        finished stays."""
+        """A process and a thread each: the teacher beside the detector, then the student, which starts from
+        the teacher's encoders. What is finished stays."""
         words = ("--object", self.model.name, "--preset", self.plan.preset, "--workers", "0", "--out")
         common = (str(self.synthetic), *words)
 
-        def training(checkpoint: Path, steps: int, after: str | None = None) -> Training:
-            words = ("train", checkpoint.stem, *common, str(checkpoint.parent))
+        def training(checkpoint: Path, steps: int, *more: str, after: str | None = None) -> Training:
+            words = ("train", checkpoint.stem, *common, str(checkpoint.parent), *more)
             return Training(words, checkpoint.with_suffix(".log.jsonl"), steps, after)
 
         steps, stages = self.experiment, (self.detector, self.teacher, self.student)
         runs = {
             "detector": training(self.detector, steps.detector.steps),
             "teacher": training(self.teacher, steps.teacher.steps),
-            "student": training(self.student, steps.student.steps, after="detector"),
+            "student": training(
+                self.student, steps.student.steps, "--teacher", str(self.teacher), after="teacher"
+            ),
         }
         finished = [path.stem for path in stages if path.exists()]
         run_side_by_side({name: run for name, run in runs.items() if name not in finished})

@@ -37,7 +37,7 @@ class Training:
         words: of the `s2p3` command line.
         log: JSON lines with a "step" that the training appends to.
         steps: how many it takes.
-        after: name of the training whose core it takes over when that one is done; None starts at once.
+        after: name of the training that it needs, or whose core it takes over; None starts at once.
     """
 
     words: tuple[str, ...]

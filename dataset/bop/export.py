@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,9 @@ from dataset.bop.models import write_models
 from dataset.bop.scene import Drawn, Scene
 from dataset.errors import SessionError, ToolkitError
 from dataset.intrinsics import Intrinsics
+from dataset.progress import Progress, silent
 from dataset.session import ObjectRecord, Session
 from dataset.subset import require_complete
-
-Progress = Callable[[int, int], None]
 
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)?")
 
@@ -31,7 +30,7 @@ def export_bop(
     draw: Drawn,
     split: str = "test",
     frames: str | None = None,
-    on_progress: Progress = lambda done, total: None,
+    on_progress: Progress = silent,
 ) -> Path:
     """Writes annotated sessions as the scenes of one split of a BOP data set; their images are undistorted.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dataset.compression import checksum
 from dataset.errors import SessionError
+from dataset.progress import Progress, silent
 from dataset.schema import FRAME_COLUMNS
 from dataset.session.clock_store import fit_stored
 from dataset.session.files import (
@@ -30,8 +31,6 @@ from dataset.session.files import (
 )
 from dataset.session.seals import seal
 from dataset.validate.salvage import copy_content
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class RepairResult:
         return text + (f"; lost: {_first(self.lost)}" if self.lost else "")
 
 
-def repair(path: str | Path, on_progress: Progress = lambda done, total: None) -> RepairResult:
+def repair(path: str | Path, on_progress: Progress = silent) -> RepairResult:
     """Restores every frame that had reached the disk and marks the session complete.
 
     The intact content goes to a new file that replaces the old one in a single step, so that an interrupted

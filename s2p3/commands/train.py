@@ -123,6 +123,7 @@ def train_student(
     object: RequiredName = "",
     out: RequiredPath = Path(),
     mesh: OptionalPath = None,
+    teacher: OptionalPath = None,
     preset: Preset = "fast",
     config: OptionalPath = None,
     threads: int = 1,
@@ -138,6 +139,8 @@ def train_student(
         object: cup, fork, knife, bottle, or the name of the object in --mesh.
         out: folder for student.safetensors and the log; an interrupted training continues.
         mesh: PLY, OBJ or STL of the object, metres.
+        teacher: teacher.safetensors from whose encoders to start, which ours learn from sooner; the paper's
+            start from ImageNet's, as without.
         preset: fast is our choice for two cores, paper the paper's values, quick a smoke test.
         config: experiment.toml, whose fields override the preset's.
         threads: CPU threads of the network.
@@ -149,7 +152,7 @@ def train_student(
         _describe("student", chosen, json)
     else:
         _all_given(object=object, out=out)
-        _supervise("student", sessions, object, mesh, chosen, out, threads, frames)
+        _supervise("student", sessions, object, mesh, chosen, out, threads, frames, teacher=teacher)
 
 
 def train_supervised(
@@ -244,6 +247,7 @@ def _supervise(
     threads: int,
     frames: FrameSource,
     stage: Literal["pretrained", "supervised"] = "pretrained",
+    teacher: Path | None = None,
 ) -> None:
     from s2p3.objects import named_object
     from s2p3.training import supervise
@@ -251,7 +255,9 @@ def _supervise(
     _use(threads, frames.workers)
     common = (_some(sessions), named_object(name, mesh), experiment, out)
     with progress_bars() as report:
-        path = supervise(network, *common, cache=out.parent, frames=frames, stage=stage, report=report)
+        path = supervise(
+            network, *common, teacher=teacher, cache=out.parent, frames=frames, stage=stage, report=report
+        )
     say(str(path))
 
 

@@ -8,7 +8,6 @@ there. Beside the session come its manifest and a picture of how informative it 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from dataset import SE3, CameraInfo, Intrinsics, RawFrame, SessionError, ToolkitError
 from dataset.importers.target import ReadWhenAsked
+from dataset.progress import Progress, silent
 from dataset.session import (
     Chunk,
     ObjectPoses,
@@ -45,7 +45,7 @@ def synthesize(
     seed: int,
     out: str | Path,
     workers: int = 1,
-    on_progress: Callable[[int, int], None] | None = None,
+    on_progress: Progress = silent,
     domain: Domain = SYNTHETIC,
     backend: Backend | None = None,
     executor: Executor = "local",
@@ -86,8 +86,7 @@ def synthesize(
             rendered(recipe, missing, workers, executor), start=count - len(missing) + 1
         ):
             parts.store(index, part)
-            if on_progress is not None:
-                on_progress(done, count)
+            on_progress(done, count)
         return _assemble(recipe, parts, count, out)
 
 

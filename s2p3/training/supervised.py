@@ -2,7 +2,8 @@
 bound, on annotated captured ones.
 
 The paper supervises both by poses alone: point matching for the rotation, L1 for the translation. The
-teacher's dense losses (`dense_weight`) are our choice; `s2p3.presets.paper` is without.
+teacher's dense losses (`dense_weight`) are our choice, and so is a student that starts from its teacher's
+encoders; `s2p3.presets.paper` is without the former.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dataset.errors import ToolkitError
 from s2p3 import inputs, losses
 from s2p3.config import ExperimentConfig, FrameSource
 from s2p3.inputs import View
@@ -48,6 +50,7 @@ def supervise(
     config: ExperimentConfig,
     out: Path,
     *,
+    teacher: Path | None = None,
     cache: Path | None = None,
     frames: FrameSource = ALL_FRAMES,
     stage: Stage = "pretrained",
@@ -59,12 +62,14 @@ def supervise(
     Args:
         kind: which of the two.
         sessions: with poses of the object, usually synthetic.
+        teacher: checkpoint of a teacher from whose encoders to start, instead of ImageNet's (our choice).
         cache: folder for the crops, shared between trainings.
         frames: which of the sessions to train on, and how they reach the training.
         stage: what the checkpoint calls this training.
         report: see `loop.Run`.
 
-    Raises ToolkitError: a session lacks the object; see also `loop.optimize`.
+    Raises ToolkitError: a session lacks the object; a teacher of another object, or of other encoders; see
+        also `loop.optimize`.
     """
     path, settings = checkpoint.to_write(out / f"{kind}.safetensors"), getattr(config, kind)
     examples = Examples.of(sessions, model, config.input, settings, frames, cache, report)
@@ -72,7 +77,11 @@ def supervise(
         signal = labelled_signal(examples.source, examples.rows, model)
         report_signal(signal, path, config.self_supervision.physics)
     torch.manual_seed(settings.seed)
-    network = _BUILDERS[kind](config, imagenet=True)
+    network = _BUILDERS[kind](config, imagenet=teacher is None)
+    hashes = examples.hashes
+    if teacher is not None:
+        network.encoder.load_state_dict(_encoders_of(teacher, model, config))
+        hashes = {**hashes, "teacher": checkpoint.file_hash(teacher)}
     data = LabelledData(examples.source, examples.rows, model.refractive_index, config)
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
     score = None
@@ -80,12 +89,26 @@ def supervise(
         scorer = PoseScorer(examples.held_out, model, config)
         score = Score(scorer.name, scorer, settings.validations, examples.origin)
     rows = examples.rows.tolist()
-    fingerprint = f"{examples.hashes} {config} {model.fingerprint} {rows} {examples.origin}"
+    fingerprint = f"{hashes} {config} {model.fingerprint} {rows} {examples.origin}"
     run = Run(kind, path, fingerprint, frames.workers, report)
     trained = optimize(network, data, objective, settings, run, score)
-    info = CheckpointInfo.of(kind, stage, model, trained.step, config, examples.hashes, trained.validation)
+    info = CheckpointInfo.of(kind, stage, model, trained.step, config, hashes, trained.validation)
     checkpoint.save(path, trained.network.state_dict(), info)
     return path
+
+
+def _encoders_of(teacher: Path, model: ObjectModel, config: ExperimentConfig) -> dict[str, Tensor]:
+    """The weights of a teacher's encoders. Raises ToolkitError: they do not fit the experiment's."""
+    guide, info = load_teacher(teacher, model)
+    theirs, ours = (
+        (one.input.modality, one.input.aolp, one.network.total_stride) for one in (info.config, config)
+    )
+    if theirs != ours:
+        raise ToolkitError(
+            f"{teacher}: its encoders see other channels than the student's, or at another stride; train "
+            "both with one experiment.toml, or start without a teacher"
+        )
+    return guide.encoder.state_dict()
 
 
 def load_teacher(path: Path, wanted: str | ObjectModel | None = None) -> tuple[Teacher, CheckpointInfo]:

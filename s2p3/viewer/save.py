@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -10,12 +9,12 @@ import numpy as np
 
 from dataset.errors import ToolkitError
 from dataset.pictures import Picture
+from dataset.progress import Progress, silent
 from dataset.session import Session
 from s2p3.viewer.charts import UNTIMED_HZ, Floats, charts_of, drawn, drawn_coverage, seconds_of
 from s2p3.viewer.look import SessionLook, titled
 from s2p3.viewer.world import world_of
 
-Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
 _FILM_TILE_PX, _PICTURE_TILE_PX = 408, 612
@@ -23,7 +22,7 @@ _SLOWEST_HZ, _FASTEST_HZ = 2.0, 30.0
 _PICTURES = 5
 
 
-def save_pictures(path: Path, out: Path, every: int = 1, on_progress: Progress | None = None) -> list[Path]:
+def save_pictures(path: Path, out: Path, every: int = 1, on_progress: Progress = silent) -> list[Path]:
     """Writes the pictures of a session into a folder, replacing earlier ones.
 
     Args:
@@ -56,7 +55,7 @@ def save_pictures(path: Path, out: Path, every: int = 1, on_progress: Progress |
     return written
 
 
-def _film(look: SessionLook, path: Path, indices: range, on_progress: Progress | None) -> Path:
+def _film(look: SessionLook, path: Path, indices: range, on_progress: Progress) -> Path:
     first, seconds = look.sheet(indices[0], _FILM_TILE_PX), seconds_of(look.session)
     size = (first.shape[1], first.shape[0])
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), _rate(seconds, indices), size)
@@ -69,8 +68,7 @@ def _film(look: SessionLook, path: Path, indices: range, on_progress: Progress |
             when = "" if seconds is None else f", {seconds[index]:.2f} s"
             corner[:] = titled(corner, f"frame {index}{when}")
             writer.write(sheet)
-            if on_progress is not None:
-                on_progress(done, len(indices))
+            on_progress(done, len(indices))
     finally:
         writer.release()
     return path

@@ -292,6 +292,24 @@ def test_a_resume_file_of_other_settings_is_refused(
         supervise("student", [cup_session], cup, other, tmp_path)
 
 
+def test_a_student_starts_from_its_teachers_encoders(
+    trained: Path, cup_session: Path, cup: ObjectModel, tmp_path: Path
+) -> None:
+    still = dataclasses.replace(tiny().student, steps=1, learning_rate=0.0, ema=0.0, validations=0)
+    experiment = dataclasses.replace(tiny(), student=still)
+    teacher = trained / "teacher.safetensors"
+    other = dataclasses.replace(experiment, input=dataclasses.replace(experiment.input, aolp="angle"))
+    with pytest.raises(ToolkitError, match="encoders see other channels"):
+        supervise("student", [cup_session], cup, other, tmp_path, teacher=teacher)
+    path = supervise("student", [cup_session], cup, experiment, tmp_path, teacher=teacher)
+    wanted, found = load_file(teacher), load_file(path)
+    stem = "encoder.polarization.stem.0.weight"
+    assert torch.equal(wanted[stem], found[stem])
+    assert json.loads(path.with_suffix(".json").read_text())["data"]["teacher"] == checkpoint.file_hash(
+        teacher
+    )
+
+
 def test_the_detector_learns(cup_session: Path, cup: ObjectModel, tmp_path: Path) -> None:
     train_detector([cup_session], cup, tiny(), tmp_path)
     log = log_of(tmp_path / "detector.log.jsonl")

@@ -92,7 +92,8 @@ def make_sets(study: Study, workers: int) -> None:
         if not path.exists():
             print(f"{path.name}: {count} frames", flush=True)
             started = time.perf_counter()
-            print(synthesize(model, count, session_camera(), seed, path, workers, None, domain, backend))
+            camera = session_camera()
+            print(synthesize(model, count, camera, seed, path, workers, domain=domain, backend=backend))
             with study.rendered.open("a", encoding="utf-8") as log:
                 log.write(f"{path.name}\t{workers}\t{time.perf_counter() - started:.0f}\n")
 

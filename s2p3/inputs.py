@@ -1,7 +1,7 @@
 """What the networks see: crops of the polarization image around a detected box, and nothing else.
 
 A frame's way: undistorted Stokes image (3, H, W) and box -> `extract_crop` (canonical, upright, larger than
-needed) -> `resample` through a `View` (zoom, shift, in-plane rotation) -> `network_input` (channels and
+needed) -> `resample` through a `View` (zoom, shift, in-plane rotation) -> `network_channels` (channels and
 priors). Everything here is computed from Stokes and depth images, intrinsics, and predicted boxes and masks;
 no pose, mask or normal of the truth is an argument.
 
@@ -285,15 +285,15 @@ def depth_channels(depth: Tensor, K: Tensor) -> Tensor:
     return torch.cat([relief, distance.expand_as(relief), known.to(depth.dtype)], dim=1)
 
 
-def network_input(
+def network_channels(
     stokes: Tensor,
     K: Tensor,
     refractive_index: float,
     config: InputConfig,
     mask: Tensor | None = None,
     depth: Tensor | None = None,
-) -> NetworkInput:
-    """Forms what the two encoders see of B crops.
+) -> tuple[Tensor, Tensor]:
+    """What the two encoders see of B crops: `NetworkInput.polarization` and `.priors`.
 
     Args:
         stokes: (B, 3, S, S) with normalized exposure.
@@ -316,6 +316,4 @@ def network_input(
         assert depth is not None, "rgbd needs depth"
         second = depth_channels(depth * shown, K)
     last = torch.channels_last
-    first, second = (image.contiguous(memory_format=last) for image in (first, second))
-    everywhere = torch.ones_like(stokes[:, :1], dtype=torch.bool)
-    return NetworkInput(first, second, K, stokes, everywhere, depth)
+    return first.contiguous(memory_format=last), second.contiguous(memory_format=last)

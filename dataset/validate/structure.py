@@ -51,7 +51,7 @@ def check_datasets(view: View) -> Iterator[Problem]:
     """
     sizes = _sizes(view)
     for declared in DATASETS:
-        for path, name in instances(view, declared.path):
+        for path, _ in instances(view, declared.path):
             node = view.file.get(path)
             if node is None:
                 if declared.required:
@@ -59,7 +59,7 @@ def check_datasets(view: View) -> Iterator[Problem]:
             elif not isinstance(node, h5py.Dataset):
                 yield Problem(path, "is a group, expected a dataset", _RERECORD)
             else:
-                problems = list(_check_dataset(node, path, declared, sizes, name))
+                problems = list(_check_dataset(node, path, declared, sizes))
                 if problems:
                     view.unusable.add(path)
                 yield from problems
@@ -124,7 +124,7 @@ def _check_attribute(node: h5py.Group, group: str, declared: Attribute) -> Itera
 
 
 def _check_dataset(
-    node: h5py.Dataset, path: str, declared: Dataset, sizes: dict[str, int], name: str
+    node: h5py.Dataset, path: str, declared: Dataset, sizes: dict[str, int]
 ) -> Iterator[Problem]:
     if not any(_has_dtype(node, kind) for kind in declared.dtypes):
         expected = " or ".join(declared.dtypes)

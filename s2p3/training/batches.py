@@ -4,7 +4,7 @@ along."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -82,11 +82,11 @@ def form_input(
     depth = None
     if crops.depth is not None:
         depth = window.resample(crops.depth[indices].float(), mode="nearest", padding="zeros")
-    seen = inputs.network_input(stokes, window.K, refractive_index, config.input, mask, depth)
-    valid = seen.valid
+    seen = inputs.network_channels(stokes, window.K, refractive_index, config.input, mask, depth)
+    valid = torch.ones_like(stokes[:, :1], dtype=torch.bool)
     if crops.valid is not None:
         valid = window.resample(crops.valid[indices].float(), padding="zeros") > _WHOLLY
-    return replace(seen, stokes=measured, valid=valid)
+    return NetworkInput(*seen, window.K, measured, valid, depth)
 
 
 def form_targets(crops: LabelledCrops, indices: Tensor, view: View, config: ExperimentConfig) -> Targets:

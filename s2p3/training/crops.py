@@ -211,7 +211,7 @@ def labelled_crop(
         depth: (H, W) metres, where there is one.
     """
     crop = _crop(stokes, mask, mask_box(mask), intrinsics, config, depth)
-    return crop | _truth(crop["K"], mask, T_cam_obj, intrinsics, model, config)
+    return crop | _truth(mask, T_cam_obj, intrinsics, model, config)
 
 
 def collate(rows: Sequence[dict[str, NDArray[np.generic]]]) -> LabelledCrops:
@@ -333,7 +333,6 @@ def _under(region: NDArray[np.float64], shape: tuple[int, ...]) -> tuple[slice, 
 
 
 def _truth(
-    K: NDArray[np.generic],
     mask: NDArray[np.bool_],
     T_cam_obj: SE3,
     intrinsics: Intrinsics,

@@ -106,11 +106,11 @@ def test_exposure_drops_out() -> None:
     stokes = torch.tensor([1.0, 0.2, -0.1]).view(1, 3, 1, 1) * torch.rand(1, 1, 8, 8)
     K = torch.tensor([[[100.0, 0, 3.5], [0, 100.0, 3.5], [0, 0, 1.0]]])
     dim, bright = (
-        inputs.network_input(inputs.normalize_exposure(stokes * gain), K, 1.5, InputConfig())
+        inputs.network_channels(inputs.normalize_exposure(stokes * gain), K, 1.5, InputConfig())
         for gain in (0.3, 2.0)
     )
-    torch.testing.assert_close(dim.polarization, bright.polarization)
-    torch.testing.assert_close(dim.priors, bright.priors, atol=1e-4, rtol=0)
+    torch.testing.assert_close(dim[0], bright[0])
+    torch.testing.assert_close(dim[1], bright[1], atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize(("aolp", "channels"), [("double_angle", 7), ("angle", 6)])
@@ -130,22 +130,22 @@ def test_a_masked_background_reaches_only_the_intensities() -> None:
     K = torch.tensor([[[100.0, 0, 3.5], [0, 100.0, 3.5], [0, 0, 1.0]]])
     mask = torch.zeros(1, 1, 8, 8)
     mask[..., :4] = 1
-    seen = inputs.network_input(stokes, K, 1.5, InputConfig(background="mask"), mask)
-    assert not seen.priors[..., 4:].any()
-    assert not seen.polarization[:, 4:, :, 4:].any()
-    assert seen.polarization[:, :4, :, 4:].any()
+    polarization, priors = inputs.network_channels(stokes, K, 1.5, InputConfig(background="mask"), mask)
+    assert not priors[..., 4:].any()
+    assert not polarization[:, 4:, :, 4:].any()
+    assert polarization[:, :4, :, 4:].any()
 
 
 def test_without_polarization_both_encoders_see_the_intensity() -> None:
     stokes = inputs.stokes_from_intensities(torch.rand(2, 4, 8, 8))
     K = torch.eye(3).expand(2, -1, -1)
     config = InputConfig(modality="rgb")
-    seen = inputs.network_input(stokes, K, 1.5, config)
-    assert (seen.polarization.shape[1], seen.priors.shape[1]) == inputs.channel_counts(config)
-    torch.testing.assert_close(seen.polarization[:, 0], inputs.intensities(stokes).mean(1))
-    assert torch.equal(seen.polarization, seen.priors)
+    first, second = inputs.network_channels(stokes, K, 1.5, config)
+    assert (first.shape[1], second.shape[1]) == inputs.channel_counts(config)
+    torch.testing.assert_close(first[:, 0], inputs.intensities(stokes).mean(1))
+    assert torch.equal(first, second)
     unpolarized = torch.cat([stokes[:, :1], torch.zeros_like(stokes[:, 1:])], dim=1)
-    assert torch.equal(seen.polarization, inputs.network_input(unpolarized, K, 1.5, config).polarization)
+    assert torch.equal(first, inputs.network_channels(unpolarized, K, 1.5, config)[0])
 
 
 def test_depth_reaches_the_second_encoder_as_relief_and_distance() -> None:
@@ -154,16 +154,14 @@ def test_depth_reaches_the_second_encoder_as_relief_and_distance() -> None:
     depth = torch.full((1, 1, 8, 8), 0.5)
     depth[..., 0, 0], depth[..., 1, 1] = 0.0, 0.55
     config = InputConfig(modality="rgbd")
-    seen = inputs.network_input(stokes, K, 1.5, config, depth=depth)
-    assert (seen.polarization.shape[1], seen.priors.shape[1]) == inputs.channel_counts(config)
-    relief, distance, known = seen.priors[0]
+    first, second = inputs.network_channels(stokes, K, 1.5, config, depth=depth)
+    assert (first.shape[1], second.shape[1]) == inputs.channel_counts(config)
+    relief, distance, known = second[0]
     assert known.sum() == 63
     assert distance[0, 0] == pytest.approx(0.5 * 8 / 100)  # the crop is so wide there
     assert relief[1, 1] == pytest.approx(0.05 * 8 / 100)
     assert relief.count_nonzero() == 1
     assert not inputs.depth_channels(torch.zeros(1, 1, 8, 8), K).any()
     mask = torch.zeros(1, 1, 8, 8)
-    masked = inputs.network_input(
-        stokes, K, 1.5, InputConfig(modality="rgbd", background="mask"), mask, depth
-    )
-    assert not masked.priors.any()
+    config = InputConfig(modality="rgbd", background="mask")
+    assert not inputs.network_channels(stokes, K, 1.5, config, mask, depth)[1].any()

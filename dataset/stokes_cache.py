@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-import os
 import shutil
 from dataclasses import astuple
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from dataset.errors import SessionError
 from dataset.progress import Progress, silent
 from dataset.session import Session
+from dataset.whole_files import replacing
 
 _VERSION = 1
 """Of the decoding and of this layout: raise it when either changes."""
@@ -89,20 +89,16 @@ def _make(session: Session, target: Path, on_progress: Progress) -> None:
             f"{session.path}: its decoded images need {size / 1e9:.1f} GB beside it; make room, or copy the "
             "session to a larger disk"
         )
-    partial = target.with_suffix(f".{os.getpid()}.partial")
     try:
         # written, not mapped: a disk that fills up meanwhile is then an error, not a crash
-        with partial.open("wb") as stream:
+        with replacing(target) as partial, partial.open("wb") as stream:
             stream.write(_header(session))
             for index in range(len(session)):
                 image = np.moveaxis(session.stokes(index).stack(), 0, -1)
                 stream.write(np.ascontiguousarray(image, "<f2").data)
                 on_progress(index + 1, len(session))
-        os.replace(partial, target)
     except OSError as error:
         raise SessionError(
             f"{session.path}: its decoded images cannot be written beside it ({error.strerror}); copy the "
             "session to a folder that may be written to, on a disk with room"
         ) from error
-    finally:
-        partial.unlink(missing_ok=True)

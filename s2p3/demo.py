@@ -32,6 +32,7 @@ from calibration.steps import add_hand_eye, add_intrinsics, add_time_offset
 from calibration.touch_steps import add_object, add_tool_tip
 from dataset.errors import ToolkitError
 from dataset.splits import split_session
+from dataset.whole_files import replacing
 from s2p3 import objects
 from s2p3.annotation import annotate
 from s2p3.board import board_spec
@@ -119,9 +120,8 @@ class Progress:
 
     def _save(self) -> None:
         text = json.dumps({"settings": self._settings, "seconds": self.seconds}, indent=1)
-        temporary = self._path.with_suffix(".part")
-        temporary.write_text(text)
-        temporary.replace(self._path)
+        with replacing(self._path) as partial:
+            partial.write_text(text)
 
 
 class Demo:

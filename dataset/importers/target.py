@@ -27,6 +27,7 @@ from dataset.session.edit import write_depth, write_origin
 from dataset.session.files import check_new
 from dataset.session.records import Image, Images, Masks
 from dataset.transforms import SE3
+from dataset.whole_files import replacing
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,13 +123,8 @@ def write_imported(out: str | Path, imported: Imported, mosaics: Iterable[Raw]) 
     """
     out = Path(out)
     check_new(out)
-    partial = out.with_name(out.name + ".partial")
-    partial.unlink(missing_ok=True)
-    try:
+    with replacing(out) as partial:
         _write(partial, imported, mosaics)
-        partial.rename(out)
-    finally:
-        partial.unlink(missing_ok=True)
     return len(imported.frame_ids)
 
 

@@ -24,6 +24,7 @@ from dataset.errors import SessionError
 from dataset.schema import FORMAT, MAJOR, TABLES, VERSION, Dataset, declaration
 from dataset.session.seals import leave_open, plain, seal
 from dataset.session.superblock import HealedFile
+from dataset.whole_files import replacing
 
 LIBVER = ("v110", "v110")
 """File format of HDF5 1.10: the oldest with single-writer-multiple-readers, readable by everything since."""
@@ -76,20 +77,15 @@ def create_whole(path: Path, needs_bytes: int) -> Iterator[h5py.File]:
     """
     check_new(path)
     _check_room(path, needs_bytes)
-    partial = path.with_name(path.name + ".partial")
     try:
-        with h5py.File(partial, "w", libver=LIBVER) as file:
+        with replacing(path) as partial, h5py.File(partial, "w", libver=LIBVER) as file:
             yield file
             seal(file)
-        os.replace(partial, path)
     except (OSError, RuntimeError) as error:
         raise SessionError(
             f"{path} cannot be written ({str(error).splitlines()[0]}); check the folder, who may write, and "
             "the free disk space"
         ) from error
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def open_for_reading(path: Path) -> tuple[h5py.File, bool]:

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dataset.whole_files import replacing
+
 _LAMP = 0.36
 """Radiance in the middle: 80 % of white at the rig's exposure for the pixel that sees most."""
 _FALLOFF = 0.25
@@ -26,9 +28,8 @@ class HandHeldPolarizer:
 
     def turn_to(self, angle: float) -> None:
         """Holds it before the lens: radians counter-clockwise as the image shows it."""
-        temporary = self._path.with_suffix(".part")
-        temporary.write_text(json.dumps({"angle": angle}), encoding="utf-8")
-        temporary.replace(self._path)
+        with replacing(self._path) as partial:
+            partial.write_text(json.dumps({"angle": angle}), encoding="utf-8")
 
     def take_away(self) -> None:
         """Clears the view."""

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from dataset.errors import ToolkitError
+from dataset.whole_files import replacing
 from s2p3.networks.teacher import TeacherOutput, pose_of
 
 TOLERANCE = 1e-4
@@ -106,18 +107,14 @@ def write_onnx(network: nn.Module, examples: Sequence[Tensor], path: Path, descr
     model = program.model_proto
     model.metadata_props.append(onnx.StringStringEntryProto(key=_DESCRIPTION, value=description))
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    onnx.save(model, temporary)
-    try:
-        worst = largest_difference(plain, OnnxNetwork.load(temporary), inputs)
+    with replacing(path) as partial:
+        onnx.save(model, partial)
+        worst = largest_difference(plain, OnnxNetwork.load(partial), inputs)
         if not worst <= TOLERANCE:
             raise ToolkitError(
                 f"{path}: the exported network differs by {worst:.1e} of the largest output (at most "
                 f"{TOLERANCE:.0e} is accepted), so it was not kept; use the checkpoint itself"
             )
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return worst
 
 

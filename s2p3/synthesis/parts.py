@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dataset import ToolkitError
+from dataset.whole_files import replacing
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,8 @@ class Parts:
 
     def store(self, index: int, part: bytes) -> None:
         """Keeps a frame; it is there whole or not at all."""
-        unfinished = self.path(index).with_suffix(".tmp")
-        unfinished.write_bytes(part)
-        unfinished.rename(self.path(index))
+        with replacing(self.path(index)) as partial:
+            partial.write_bytes(part)
 
     def _require_same(self, kept: str, request: dict[str, Any]) -> None:
         frames = len(list(self.folder.glob("*.npz")))

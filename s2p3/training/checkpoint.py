@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 from acquisition import typed_toml
 from dataset.errors import ToolkitError
 from dataset.symmetry import Symmetry
+from dataset.whole_files import replacing
 from s2p3.config import ExperimentConfig
 from s2p3.objects import SAME_INDEX, SAME_SIZE, ObjectModel
 from s2p3.provenance import toolkit_state
@@ -144,9 +144,8 @@ def save(path: Path, weights: dict[str, Tensor], info: CheckpointInfo) -> None:
 
 def save_text(path: Path, text: str) -> None:
     """Writes a text file atomically: a reader sees the old file or the new one."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:
@@ -154,17 +153,14 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str
 
     Raises ToolkitError: it cannot be written.
     """
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")  # several processes may write the same
     try:
-        temporary.touch()
-        mode = temporary.stat().st_mode
-        save_file(
-            {name: tensor.detach().contiguous() for name, tensor in tensors.items()}, temporary, metadata
-        )
-        temporary.chmod(mode)  # safetensors writes for the owner only
-        temporary.replace(path)
+        with replacing(path) as partial:
+            partial.touch()
+            mode = partial.stat().st_mode
+            whole = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
+            save_file(whole, partial, metadata)
+            partial.chmod(mode)  # safetensors writes for the owner only
     except (OSError, SafetensorError) as error:
-        temporary.unlink(missing_ok=True)
         raise ToolkitError(
             f"{path}: cannot be written ({error}); check the disk's space and who may write there"
         ) from error

@@ -51,6 +51,7 @@ from plan import (
 from results import result_of
 
 from dataset.session import Session
+from dataset.whole_files import replacing
 from s2p3 import objects
 from s2p3.evaluation import evaluate, find_objects
 from s2p3.networks.detector import Detection
@@ -116,9 +117,8 @@ def find_captured(study: Study, name: str) -> None:
     masks = [np.zeros(shape, bool) if one is None else one.mask for one in found]
     boxes = [np.zeros(4) if one is None else one.box_xywh for one in found]
     scores = [np.nan if one is None else one.score for one in found]
-    part = study.found(name).with_suffix(".part.npz")
-    np.savez_compressed(part, mask=np.packbits(masks, axis=-1), box=boxes, score=scores)
-    part.replace(study.found(name))
+    with replacing(study.found(name)) as partial, partial.open("wb") as stream:
+        np.savez_compressed(stream, mask=np.packbits(masks, axis=-1), box=boxes, score=scores)
 
 
 def found_in(study: Study, name: str) -> list[Detection | None]:

@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from dataset.errors import ToolkitError
 from s2p3.commands.arguments import at_least
@@ -28,16 +28,7 @@ def intrinsics(*, rig: Path, out: Path, views: int = 24, dry_run: bool = False) 
         views: how many stills to take.
         dry_run: move nothing: plan, and draw the route on a page beside OUT.
     """
-    from acquisition.capture import capture_board
-    from acquisition.rig import Rig
-
-    at_least(1, views=views)
-    if dry_run:
-        _draw_stills(Rig.load(rig), out, views)
-        return
-    with recording("stills") as report:
-        done = capture_board(Rig.load(rig), out, kind="intrinsics", views=views, on_progress=report)
-    say(summary(out, done))
+    _stills("intrinsics", rig, out, views, dry_run)
 
 
 def hand_eye(*, rig: Path, out: Path, views: int = 24, dry_run: bool = False) -> None:
@@ -49,16 +40,7 @@ def hand_eye(*, rig: Path, out: Path, views: int = 24, dry_run: bool = False) ->
         views: how many stills to take.
         dry_run: move nothing: plan, and draw the route on a page beside OUT.
     """
-    from acquisition.capture import capture_board
-    from acquisition.rig import Rig
-
-    at_least(1, views=views)
-    if dry_run:
-        _draw_stills(Rig.load(rig), out, views)
-        return
-    with recording("stills") as report:
-        done = capture_board(Rig.load(rig), out, kind="hand_eye", views=views, on_progress=report)
-    say(summary(out, done))
+    _stills("hand_eye", rig, out, views, dry_run)
 
 
 def board_motion(*, rig: Path, out: Path, seconds: float = 14.0, dry_run: bool = False) -> None:
@@ -178,6 +160,19 @@ def sequence(
         return
     with recording("frames") as report:
         done = capture_sequence(Rig.load(rig), out, seconds=seconds, append=append, on_progress=report)
+    say(summary(out, done))
+
+
+def _stills(kind: Literal["intrinsics", "hand_eye"], rig: Path, out: Path, views: int, dry_run: bool) -> None:
+    from acquisition.capture import capture_board
+    from acquisition.rig import Rig
+
+    at_least(1, views=views)
+    if dry_run:
+        _draw_stills(Rig.load(rig), out, views)
+        return
+    with recording("stills") as report:
+        done = capture_board(Rig.load(rig), out, kind=kind, views=views, on_progress=report)
     say(summary(out, done))
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from dataset import SE3, Intrinsics
 from dataset.errors import ToolkitError
-from dataset.session import Session, mask_box
+from dataset.session import ObjectPoses, Session, mask_box
 from dataset.stokes_cache import images_hash
 from s2p3.config import InputConfig
 from s2p3.inputs import crop_intrinsics, extract_crop, extract_depth, square_box
@@ -156,17 +156,7 @@ def labelled_crops(
             poses = poses_of(session, model)
             for index in (index for which, index in shown if which == number):
                 stokes = np.moveaxis(session.stokes(index).stack(), 0, -1)
-                mask, pose = poses.mask(index), poses.T_cam_obj[index]
-                crop = labelled_crop(
-                    stokes,
-                    mask,
-                    pose,
-                    session.working_intrinsics,
-                    model,
-                    config,
-                    depth_of(session, index, config),
-                )
-                rows.append(crop)
+                rows.append(labelled_crop(session, poses, index, stokes, model, config))
                 report(f"crops of {model.name}", len(rows), len(shown), {})
     crops = collate(rows)
     if stored is not None:
@@ -195,23 +185,22 @@ def shown_rows(paths: Sequence[Path], model: ObjectModel) -> list[tuple[int, int
 
 
 def labelled_crop(
+    session: Session,
+    poses: ObjectPoses,
+    index: int,
     stokes: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    T_cam_obj: SE3,
-    intrinsics: Intrinsics,
     model: ObjectModel,
     config: InputConfig,
-    depth: NDArray[np.float32] | None = None,
 ) -> dict[str, NDArray[np.generic]]:
-    """One row of `LabelledCrops`.
+    """A frame that shows the object as a row of `LabelledCrops`.
 
     Args:
+        poses: the session's, of the object.
         stokes: (H, W, 3) undistorted, or a memory map of it: only the part under the crop is read.
-        mask: (H, W), visible, not empty.
-        depth: (H, W) metres, where there is one.
     """
-    crop = _crop(stokes, mask, mask_box(mask), intrinsics, config, depth)
-    return crop | _truth(mask, T_cam_obj, intrinsics, model, config)
+    mask, depth, camera = poses.mask(index), depth_of(session, index, config), session.working_intrinsics
+    crop = _crop(stokes, mask, mask_box(mask), camera, config, depth)
+    return crop | _truth(mask, poses.T_cam_obj[index], camera, model, config)
 
 
 def collate(rows: Sequence[dict[str, NDArray[np.generic]]]) -> LabelledCrops:

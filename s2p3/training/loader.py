@@ -30,7 +30,7 @@ from dataset.session import Session
 from dataset.stokes_cache import cached_stokes
 from s2p3.config import InputConfig
 from s2p3.objects import ObjectModel
-from s2p3.training.crops import LabelledCrops, collate, depth_of, labelled_crop, shown_rows
+from s2p3.training.crops import LabelledCrops, collate, labelled_crop, shown_rows
 from s2p3.training.trees import named_tensors
 
 _SHARED_MEMORY = Path("/dev/shm")  # where torch puts the tensors of several processes on Linux
@@ -77,15 +77,7 @@ class CropDataset(Dataset[Row]):
         number, index = self.rows[row]
         session, stokes = self._opened(number)
         poses = session.object_poses(self.model.name)
-        return labelled_crop(
-            stokes[index],
-            poses.mask(index),
-            poses.T_cam_obj[index],
-            session.working_intrinsics,
-            self.model,
-            self.config,
-            depth_of(session, index, self.config),
-        )
+        return labelled_crop(session, poses, index, stokes[index], self.model, self.config)
 
     def take(self, rows: Tensor) -> LabelledCrops:
         """Some rows as one batch."""

@@ -50,7 +50,7 @@ class Detector(nn.Module):
     """Lite0 blocks 0-10 with a decoder back to stride 2, one mask per class and four distances per cell, to
     the box of the class that the cell shows."""
 
-    def __init__(self, classes: int = 1, imagenet: bool = True) -> None:
+    def __init__(self, classes: int, imagenet: bool) -> None:
         super().__init__()
         self.classes = classes
         self.trunk = Lite0(4, _BLOCKS, _TAPS)

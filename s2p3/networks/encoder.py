@@ -27,7 +27,7 @@ class DualEncoder(nn.Module):
         skip_channels: of the features at strides 4, 8 and 16.
     """
 
-    def __init__(self, channels: tuple[int, int], total_stride: int = 32, imagenet: bool = True) -> None:
+    def __init__(self, channels: tuple[int, int], total_stride: int, imagenet: bool) -> None:
         super().__init__()
         first, second = channels
         self.normalize_polarization = nn.BatchNorm2d(first, affine=False, momentum=0.02)

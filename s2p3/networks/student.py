@@ -17,10 +17,10 @@ class Student(nn.Module):
         self,
         channels: tuple[int, int],
         size: int,
-        total_stride: int = 32,
-        width: int = 96,
-        hidden: int = 96,
-        imagenet: bool = True,
+        total_stride: int,
+        width: int,
+        hidden: int,
+        imagenet: bool,
     ) -> None:
         super().__init__()
         self.encoder = DualEncoder(channels, total_stride, imagenet)

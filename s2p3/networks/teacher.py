@@ -56,9 +56,9 @@ class Teacher(nn.Module):
         self,
         channels: tuple[int, int],
         size: int,
-        total_stride: int = 32,
-        width: int = 64,
-        imagenet: bool = True,
+        total_stride: int,
+        width: int,
+        imagenet: bool,
     ) -> None:
         super().__init__()
         self.encoder = DualEncoder(channels, total_stride, imagenet)

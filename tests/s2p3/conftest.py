@@ -15,6 +15,7 @@ from dataset.session import ObjectPoses, ObjectRecord, SessionWriter, write_pose
 from s2p3 import objects, physics
 from s2p3.objects import ObjectModel
 from s2p3.rendering import rasterize
+from tests.s2p3.untrained import eager_detector_config, save_untrained
 
 FRAMES = 8
 HEIGHT, WIDTH = 256, 320  # of the raw mosaic; the polarization image is half as large
@@ -28,6 +29,12 @@ def _one_thread() -> None:
 @pytest.fixture(scope="session")
 def cup() -> ObjectModel:
     return objects.build("cup")
+
+
+@pytest.fixture(scope="module")
+def networks(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> dict[str, Path]:
+    """Checkpoints of untrained networks: teacher, student, and a detector that sees the cup everywhere."""
+    return save_untrained(tmp_path_factory.mktemp("networks"), cup, eager_detector_config())
 
 
 @pytest.fixture(scope="session")

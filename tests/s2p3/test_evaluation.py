@@ -30,7 +30,7 @@ def networks(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> tupl
     folder = tmp_path_factory.mktemp("networks")
     config = presets.quick()
     paths = folder / "student.safetensors", folder / "detector.safetensors"
-    student, detector = build_student(config), Detector(imagenet=False)
+    student, detector = build_student(config), Detector(1, imagenet=False)
     kinds: tuple[Kind, ...] = ("student", "detector")
     for path, kind, network in zip(paths, kinds, (student, detector), strict=True):
         checkpoint.save(path, network.state_dict(), CheckpointInfo.of(kind, "pretrained", cup, 0, config, {}))

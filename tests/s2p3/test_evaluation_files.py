@@ -23,13 +23,6 @@ from s2p3.training import checkpoint
 from tests.s2p3.evaluations import evaluation, missed, record
 from tests.s2p3.untrained import eager_detector_config, save_untrained
 
-Networks = dict[str, Path]
-
-
-@pytest.fixture(scope="module")
-def networks(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> Networks:
-    return save_untrained(tmp_path_factory.mktemp("networks"), cup, eager_detector_config())
-
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory, cup_session: Path) -> Path:
@@ -39,7 +32,7 @@ def session(tmp_path_factory: pytest.TempPathFactory, cup_session: Path) -> Path
     return path
 
 
-def words(session: Path, networks: Networks, network: str = "student", name: str = "cup") -> list[str]:
+def words(session: Path, networks: dict[str, Path], network: str = "student", name: str = "cup") -> list[str]:
     chosen = ["--network", str(networks[network]), "--detector", str(networks["detector"])]
     return ["evaluate", str(session), "--object", name, *chosen]
 
@@ -53,7 +46,7 @@ def refusal(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> str:
 
 
 def test_an_evaluation_leaves_figures_report_and_results(
-    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     first, second = tmp_path / "teacher.json", tmp_path / "student.json"
     assert main([*words(session, networks, "teacher"), "--out", str(first)]) == 0
@@ -88,7 +81,7 @@ def test_results_hold_the_estimates_as_the_bop_toolkit_reads_them(cup: ObjectMod
 
 
 def test_a_checkpoint_of_another_object_is_refused(
-    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     other = save_untrained(tmp_path, build("fork"), eager_detector_config())
     for kind in ("student", "detector"):
@@ -97,7 +90,7 @@ def test_a_checkpoint_of_another_object_is_refused(
 
 
 def test_a_checkpoint_of_another_kind_is_refused(
-    session: Path, networks: Networks, capfd: pytest.CaptureFixture[str]
+    session: Path, networks: dict[str, Path], capfd: pytest.CaptureFixture[str]
 ) -> None:
     line = refusal(words(session, networks | {"detector": networks["student"]}), capfd)
     assert "holds a student, not a detector" in line
@@ -106,7 +99,7 @@ def test_a_checkpoint_of_another_kind_is_refused(
 
 
 def test_a_checkpoint_of_another_input_set_is_refused(
-    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     info, moved = checkpoint.read_info(networks["student"]), tmp_path / "student.safetensors"
     config = replace(info.config, input=replace(info.config.input, aolp="angle"))
@@ -116,7 +109,7 @@ def test_a_checkpoint_of_another_input_set_is_refused(
 
 
 def test_a_session_without_the_object_is_refused(
-    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     other = save_untrained(tmp_path, build("fork"), eager_detector_config())
     assert "object 'fork' has no poses; run: s2p3 annotate" in refusal(
@@ -125,7 +118,7 @@ def test_a_session_without_the_object_is_refused(
 
 
 def test_an_unknown_or_empty_split_is_refused(
-    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert "no split 'night'" in refusal([*words(session, networks), "--split", "night"], capfd)
     empty = Path(shutil.copy(session, tmp_path / "empty.h5"))
@@ -138,7 +131,11 @@ def test_an_unknown_or_empty_split_is_refused(
 
 
 def test_a_mesh_in_millimetres_is_refused(
-    session: Path, networks: Networks, cup: ObjectModel, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path,
+    networks: dict[str, Path],
+    cup: ObjectModel,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     mesh = tmp_path / "cup.ply"
     trimesh.Trimesh(1000 * cup.vertices, cup.faces).export(mesh)
@@ -146,7 +143,7 @@ def test_a_mesh_in_millimetres_is_refused(
 
 
 def test_what_cannot_stand_beside_is_refused(
-    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "not.json").write_text("{}")
     line = refusal([*words(session, networks), "--beside", str(tmp_path / "not.json")], capfd)
@@ -171,7 +168,7 @@ def test_evaluations_are_called_by_the_shortest_end_of_the_path_that_tells_them_
 
 
 def test_evaluations_of_the_same_name_stand_beside_each_other(
-    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     outs = [tmp_path / row / "test.json" for row in ("row-1", "row-2", "row-3")]
     for kind, out in zip(("teacher", "student"), outs, strict=False):

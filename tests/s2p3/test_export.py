@@ -19,7 +19,6 @@ from s2p3.networks import onnx_files
 from s2p3.networks.detector import Detection
 from s2p3.networks.onnx_files import OnnxNetwork, write_onnx
 from s2p3.objects import ObjectModel
-from tests.s2p3.untrained import eager_detector_config, save_untrained
 
 pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed")
 
@@ -29,11 +28,6 @@ class Doubled(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return 2 * x
-
-
-@pytest.fixture(scope="module")
-def networks(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> dict[str, Path]:
-    return save_untrained(tmp_path_factory.mktemp("networks"), cup, eager_detector_config())
 
 
 @pytest.fixture(scope="module")

@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from torch import nn
 
 from s2p3 import presets
+from s2p3.config import ExperimentConfig
 from s2p3.inputs import channel_counts
-from s2p3.networks import Student, Teacher, build_student, build_teacher, detector, pose_head, pose_of
+from s2p3.networks import Teacher, build_student, build_teacher, detector, pose_head, pose_of
 from s2p3.networks.depthwise import DepthwiseConv
 from s2p3.networks.detector import Detector
 from s2p3.networks.lite0 import Lite0, load_imagenet
 
 IMAGE = np.random.default_rng(0).random((3, 128, 160), dtype=np.float32)
-SEEN = (7, 9)
 SIZES = [(64, 16), (128, 32), (128, 16), (256, 32)]
 
 
@@ -30,17 +30,23 @@ def parameters(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
 
 
+def sized(size: int, stride: Literal[16, 32]) -> ExperimentConfig:
+    base = presets.fast()
+    seen = replace(base.input, size=size, canonical_size=2 * size)
+    return replace(base, input=seen, network=replace(base.network, total_stride=stride))
+
+
 def test_the_networks_weigh_what_the_paper_says() -> None:
-    assert parameters(Teacher(SEEN, 256, imagenet=False)) == pytest.approx(5.5e6, rel=0.01)
-    assert parameters(Student(SEEN, 256, imagenet=False)) == pytest.approx(5.0e6, rel=0.01)
+    assert parameters(build_teacher(presets.paper())) == pytest.approx(5.5e6, rel=0.01)
+    assert parameters(build_student(presets.paper())) == pytest.approx(5.0e6, rel=0.01)
 
 
 @pytest.mark.parametrize(("size", "stride"), SIZES)
-def test_the_networks_predict_at_every_size(size: int, stride: int) -> None:
+def test_the_networks_predict_at_every_size(size: int, stride: Literal[16, 32]) -> None:
     polarization, priors = torch.randn(2, 7, size, size), torch.randn(2, 9, size, size)
     with torch.no_grad():
-        output = Teacher(SEEN, size, stride, imagenet=False).eval()(polarization, priors)
-        pose = Student(SEEN, size, stride, imagenet=False).eval()(polarization, priors)
+        output = build_teacher(sized(size, stride)).eval()(polarization, priors)
+        pose = build_student(sized(size, stride)).eval()(polarization, priors)
     assert output.pose.shape == pose.shape == (2, 9)
     assert output.mask_logits.shape == (2, 1, size // 4, size // 4)
     assert output.coordinates.shape == output.normals.shape == (2, 3, size // 4, size // 4)
@@ -139,7 +145,7 @@ class _Oracle(Detector):
     """Stands in for trained weights: answers with a given mask and the distances to its box."""
 
     def __init__(self, probability: torch.Tensor, box: tuple[float, float, float, float]) -> None:
-        super().__init__(imagenet=False)
+        super().__init__(1, imagenet=False)
         self._probability, self._box = probability, box
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

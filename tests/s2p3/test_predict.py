@@ -24,16 +24,7 @@ from s2p3.evaluation.predict import PoseEstimate
 from s2p3.evaluation.predictions import Prediction
 from s2p3.evaluation.shots import Shot, folder_shots, session_shots
 from s2p3.networks.detector import Detection
-from s2p3.objects import ObjectModel
 from tests.s2p3.conftest import FRAMES
-from tests.s2p3.untrained import eager_detector_config, save_untrained
-
-Networks = dict[str, Path]
-
-
-@pytest.fixture(scope="module")
-def networks(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> Networks:
-    return save_untrained(tmp_path_factory.mktemp("networks"), cup, eager_detector_config())
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, cup_session: Path) -> Path:
     return path
 
 
-def words(source: Path, networks: Networks) -> list[str]:
+def words(source: Path, networks: dict[str, Path]) -> list[str]:
     chosen = ["--network", str(networks["student"]), "--detector", str(networks["detector"])]
     return ["predict", str(source), "--object", "cup", *chosen]
 
@@ -61,7 +52,7 @@ def printed(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> list[dic
 
 
 def test_a_session_gives_a_line_and_a_picture_for_every_frame(
-    cup_session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    cup_session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     rows = printed([*words(cup_session, networks), "--out", str(out)], capfd)
@@ -75,7 +66,7 @@ def test_a_session_gives_a_line_and_a_picture_for_every_frame(
 
 
 def test_predictions_do_not_change_without_the_truth(
-    cup_session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    cup_session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     blind = Path(shutil.copy(cup_session, tmp_path / "blind.h5"))
     with h5py.File(blind, "r+") as file:
@@ -90,7 +81,7 @@ def test_predictions_do_not_change_without_the_truth(
 
 
 def test_a_folder_of_raw_frames_is_seen_as_the_session_is(
-    cup_session: Path, folder: Path, networks: Networks, capfd: pytest.CaptureFixture[str]
+    cup_session: Path, folder: Path, networks: dict[str, Path], capfd: pytest.CaptureFixture[str]
 ) -> None:
     calibration = Calibration.load(folder / "calibration.json")
     with Session.open(cup_session) as session:
@@ -178,7 +169,7 @@ def test_what_cannot_be_predicted_on_is_refused(
     options: list[str],
     said: str,
     folder: Path,
-    networks: Networks,
+    networks: dict[str, Path],
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:

@@ -21,22 +21,16 @@ from s2p3.rendering import rasterize
 from s2p3.training.checkpoint import read_info
 from tests.s2p3.untrained import eager_detector_config, save_untrained
 
-Networks = dict[str, Path]
 FEW = ["--preset", "quick", "--workers", "0"]
 
 
 @pytest.fixture(scope="module")
-def networks(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> Networks:
-    return save_untrained(tmp_path_factory.mktemp("networks"), cup, eager_detector_config())
-
-
-@pytest.fixture(scope="module")
-def rgb(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> Networks:
+def rgb(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> dict[str, Path]:
     return save_untrained(tmp_path_factory.mktemp("rgb"), cup, with_modality("rgb"))
 
 
 @pytest.fixture(scope="module")
-def rgbd(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> Networks:
+def rgbd(tmp_path_factory: pytest.TempPathFactory, cup: ObjectModel) -> dict[str, Path]:
     return save_untrained(tmp_path_factory.mktemp("rgbd"), cup, with_modality("rgbd"))
 
 
@@ -65,7 +59,7 @@ def with_modality(modality: str) -> ExperimentConfig:
     return dataclasses.replace(base, input=seen)
 
 
-def adapting(session: Path, networks: Networks, out: Path, name: str = "cup") -> list[str]:
+def adapting(session: Path, networks: dict[str, Path], out: Path, name: str = "cup") -> list[str]:
     chosen = [word for kind in networks for word in (f"--{kind}", str(networks[kind]))]
     few = ["--workers", "0", "--config.self-supervision.steps", "1", "--config.self-supervision.batch", "2"]
     few += ["--config.self-supervision.adapt-batches", "1"]
@@ -104,7 +98,7 @@ def test_adapting_and_evaluating_on_an_empty_or_missing_split(
     split: str,
     said: str,
     session: Path,
-    networks: Networks,
+    networks: dict[str, Path],
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
@@ -114,7 +108,7 @@ def test_adapting_and_evaluating_on_an_empty_or_missing_split(
 
 
 def test_networks_of_another_object(
-    session: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     refused(adapting(session, networks, tmp_path, "fork"), "was trained for 'cup', not 'fork'", capfd)
     chosen = ["--network", str(networks["student"]), "--detector", str(networks["detector"])]
@@ -122,14 +116,22 @@ def test_networks_of_another_object(
 
 
 def test_a_teacher_that_sees_something_else_than_its_student(
-    session: Path, networks: Networks, rgb: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path,
+    networks: dict[str, Path],
+    rgb: dict[str, Path],
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     mixed = {**networks, "teacher": rgb["teacher"]}
     refused(adapting(session, mixed, tmp_path), "expect different inputs", capfd)
 
 
 def test_nothing_is_detected(
-    session: Path, networks: Networks, cup: ObjectModel, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path,
+    networks: dict[str, Path],
+    cup: ObjectModel,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     base = eager_detector_config()
     strict = dataclasses.replace(base, detector=dataclasses.replace(base.detector, threshold=0.999))
@@ -149,7 +151,7 @@ def test_a_mesh_in_millimetres(session: Path, tmp_path: Path, capfd: pytest.Capt
 
 
 def test_networks_that_see_depth_where_there_is_none(
-    session: Path, rgbd: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    session: Path, rgbd: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     capfd.readouterr()
     assert main(adapting(session, rgbd, tmp_path)) == 2
@@ -159,7 +161,7 @@ def test_networks_that_see_depth_where_there_is_none(
 
 
 def test_the_baseline_wants_networks_without_polarization(
-    with_depth: Path, networks: Networks, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    with_depth: Path, networks: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     capfd.readouterr()
     assert main([*adapting(with_depth, networks, tmp_path), "--method", "self6d"]) == 2
@@ -168,8 +170,8 @@ def test_the_baseline_wants_networks_without_polarization(
 
 def test_both_methods_adapt_a_student(
     with_depth: Path,
-    networks: Networks,
-    rgb: Networks,
+    networks: dict[str, Path],
+    rgb: dict[str, Path],
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
@@ -197,7 +199,7 @@ def test_an_annotated_split_is_trained_on_as_synthetic_sets_are(session: Path, t
 def test_a_baseline_is_trained_and_predicts(
     modality: str,
     with_depth: Path,
-    networks: Networks,
+    networks: dict[str, Path],
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:

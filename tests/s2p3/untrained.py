@@ -28,7 +28,7 @@ def save_untrained(folder: Path, model: ObjectModel, config: ExperimentConfig) -
     networks = {
         "teacher": build_teacher(config),
         "student": build_student(config),
-        "detector": Detector(imagenet=False),
+        "detector": Detector(1, imagenet=False),
     }
     paths = {}
     for kind, network in networks.items():

@@ -38,7 +38,7 @@ def measure(rounds: int) -> dict[str, float]:
     seen = [torch.rand(1, channels, side, side) for channels in channel_counts(settings.input)]
     fast = [image.contiguous(memory_format=torch.channels_last) for image in seen]
     student, teacher = build_student(settings).eval(), build_teacher(settings).eval()
-    detector = channels_last(Detector(imagenet=False)).eval()
+    detector = channels_last(Detector(1, imagenet=False)).eval()
     stokes = torch.rand(1, 3, height, width) * torch.tensor([1.0, 0.2, 0.2]).view(1, 3, 1, 1)
     image = np.ascontiguousarray(stokes[0].numpy())
     K = torch.tensor([[[800.0, 0, width / 2], [0, 800.0, height / 2], [0, 0, 1]]])

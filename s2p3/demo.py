@@ -232,20 +232,19 @@ class Demo:
     def train(self) -> None:
         """A process and a thread each: the teacher beside the detector, then the student, which starts from
         the teacher's encoders. What is finished stays."""
-        words = ("--object", self.model.name, "--preset", self.plan.preset, "--workers", "0", "--out")
-        common = (str(self.synthetic), *words)
+        common = (str(self.synthetic), "--object", self.model.name, "--preset", self.plan.preset)
 
         def training(checkpoint: Path, steps: int, *more: str, after: str | None = None) -> Training:
-            words = ("train", checkpoint.stem, *common, str(checkpoint.parent), *more)
+            words = ("train", checkpoint.stem, *common, "--out", str(checkpoint.parent), *more)
             return Training(words, checkpoint.with_suffix(".log.jsonl"), steps, after)
 
         steps, stages = self.experiment, (self.detector, self.teacher, self.student)
+        alone, beside = ("--workers", "1"), ("--workers", "0")  # the student has a core to augment on
+        start = ("--teacher", str(self.teacher))
         runs = {
-            "detector": training(self.detector, steps.detector.steps),
-            "teacher": training(self.teacher, steps.teacher.steps),
-            "student": training(
-                self.student, steps.student.steps, "--teacher", str(self.teacher), after="teacher"
-            ),
+            "detector": training(self.detector, steps.detector.steps, *beside),
+            "teacher": training(self.teacher, steps.teacher.steps, *beside),
+            "student": training(self.student, steps.student.steps, *start, *alone, after="teacher"),
         }
         finished = [path.stem for path in stages if path.exists()]
         run_side_by_side({name: run for name, run in runs.items() if name not in finished})
@@ -254,7 +253,8 @@ class Demo:
         if not self.adapted.exists():
             networks = (self.detector, self.teacher, self.student)
             with progress_bars() as report:
-                adapt(self.sequence, "train", self.model, *networks, self.adapted.parent, report=report)
+                out = self.adapted.parent
+                adapt(self.sequence, "train", self.model, *networks, out, workers=1, report=report)
 
     def evaluate(self) -> None:
         networks = {"teacher": self.teacher, "before": self.student, "after": self.adapted}

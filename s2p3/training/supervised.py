@@ -72,16 +72,16 @@ def supervise(
         also `loop.optimize`.
     """
     path, settings = checkpoint.to_write(out / f"{kind}.safetensors"), getattr(config, kind)
+    start = None if teacher is None else _encoders_of(teacher, model, config)
     examples = Examples.of(sessions, model, config.input, settings, frames, cache, report)
     if config.input.modality == "polarization":
         signal = labelled_signal(examples.source, examples.rows, model)
         report_signal(signal, path, config.self_supervision.physics)
     torch.manual_seed(settings.seed)
-    network = _BUILDERS[kind](config, imagenet=teacher is None)
-    hashes = examples.hashes
-    if teacher is not None:
-        network.encoder.load_state_dict(_encoders_of(teacher, model, config))
-        hashes = {**hashes, "teacher": checkpoint.file_hash(teacher)}
+    network = _BUILDERS[kind](config, imagenet=start is None)
+    if start is not None:
+        network.encoder.load_state_dict(start)
+    hashes = examples.hashes | ({} if teacher is None else {"teacher": checkpoint.file_hash(teacher)})
     data = LabelledData(examples.source, examples.rows, model.refractive_index, config)
     objective = SupervisedObjective(*model_tensors(model), model.diameter, settings.dense_weight)
     score = None

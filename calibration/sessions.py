@@ -15,10 +15,11 @@ from calibration.hand_eye import HandEyeResult, calibrate_hand_eye
 from calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
 from calibration.records import FixedCameraRecord, HandEyeRecord, IntrinsicsRecord
 from calibration.result import Calibration
+from calibration.streams import ArmTrace
 from calibration.time_offset import TimeOffsetResult, estimate_time_offset
 from dataset.errors import CalibrationError
 from dataset.session import Session
-from dataset.transforms import SE3, interpolate_poses
+from dataset.transforms import SE3
 
 Floats = NDArray[np.float64]
 Detections = list[tuple[int, Detection]]
@@ -229,13 +230,12 @@ def camera_poses(session: Session, calibration: Calibration) -> CameraPoses:
     offset_s, offset_sigma_s = (0.0, 0.0) if offset is None else (offset.offset_s, offset.sigma_s)
     times_ns, trace = arm_trace(session)
     origin = int(times_ns[0])
-    times = np.asarray((times_ns - origin) * 1e-9, np.float64)
+    arm = ArmTrace(np.asarray((times_ns - origin) * 1e-9, np.float64), trace)
     at = np.asarray((session.mid_exposure_host_ns - origin) * 1e-9 + offset_s, np.float64)
-    known = (at >= times[0]) & (at <= times[-1]) & (_hole_around(times, at) < _longest_hole_s(times))
-    T_base_cam = interpolate_poses(times, trace, np.clip(at, times[0], times[-1])) @ T_tcp_cam
-    before = interpolate_poses(times, trace, np.clip(at - _SLOPE_SPAN_S, times[0], times[-1]))
-    after = interpolate_poses(times, trace, np.clip(at + _SLOPE_SPAN_S, times[0], times[-1]))
-    moved = (before @ T_tcp_cam).inverse() @ (after @ T_tcp_cam)
+    known = arm.covers(at) & (_hole_around(arm.times_s, at) < _longest_hole_s(arm.times_s))
+    T_base_cam = arm.at(at) @ T_tcp_cam
+    before, after = arm.at(at - _SLOPE_SPAN_S) @ T_tcp_cam, arm.at(at + _SLOPE_SPAN_S) @ T_tcp_cam
+    moved = before.inverse() @ after
     speed = np.linalg.norm(moved.translation, axis=1) / (2 * _SLOPE_SPAN_S)
     turning = np.linalg.norm(moved.as_rotvec(), axis=1) / (2 * _SLOPE_SPAN_S)
     time_variance = offset_sigma_s**2 + session.time_sigma_s**2

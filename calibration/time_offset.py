@@ -20,7 +20,7 @@ from calibration.intrinsics import board_pose
 from calibration.streams import RANGE_S, ArmTrace, Correlation, correlate_turning
 from dataset.errors import CalibrationError
 from dataset.intrinsics import Intrinsics
-from dataset.transforms import SE3, interpolate_poses
+from dataset.transforms import SE3
 
 MIN_FRAMES = 8
 _SCAN_STEP_S = 0.01
@@ -153,7 +153,7 @@ def estimate_time_offset(
 def _correlate(problem: _Problem, detections: list[Detection], spec: BoardSpec) -> Correlation | None:
     order = np.argsort(problem.mid_s)
     seen = SE3.stack([board_pose(detections[i], spec, problem.intrinsics) for i in order])
-    return correlate_turning(problem.mid_s[order], seen, ArmTrace(problem.trace_s, problem.trace))
+    return correlate_turning(problem.mid_s[order], seen, problem.arm)
 
 
 def _refined(
@@ -169,9 +169,9 @@ def _refined(
         problem.T_tcp_cam,
         T_base_board,
         problem.intrinsics,
-        problem.trace[:1],
+        problem.arm.T_base_tcp[:1],
         np.zeros((int(used.sum()), 6)),
-        moving=TimedArm(ArmTrace(problem.trace_s, problem.trace), problem.mid_s[used]),
+        moving=TimedArm(problem.arm, problem.mid_s[used]),
     ).at_offset(offset)
     free = state.free(offset=True)
     information = np.zeros((len(free), len(free)))
@@ -200,8 +200,7 @@ class _Problem:
     observations: Observations
     board_in_base: Floats
     mid_s: Floats
-    trace_s: Floats
-    trace: SE3
+    arm: ArmTrace
     intrinsics: Intrinsics
     T_tcp_cam: SE3
 
@@ -236,21 +235,18 @@ class _Problem:
             observations,
             T_base_board.apply(observations.board),
             np.asarray((host_mid_ns - origin) * 1e-9, np.float64),
-            np.asarray((trace_ns - origin) * 1e-9, np.float64),
-            trace,
+            ArmTrace(np.asarray((trace_ns - origin) * 1e-9, np.float64), trace),
             intrinsics,
             T_tcp_cam,
         )
 
     def covered(self, dt: float) -> NDArray[np.bool_]:
         """(N,) frames whose time, and a little either side of it, the trace covers."""
-        at = self.mid_s + dt
-        return (at - _SLOPE_SPAN_S >= self.trace_s[0]) & (at + _SLOPE_SPAN_S <= self.trace_s[-1])
+        return self.arm.covers(self.mid_s + dt, _SLOPE_SPAN_S)
 
     def residual(self, dt: float) -> Floats:
         """(P, 2) predicted - seen, `_FAR` where there is no prediction."""
-        at = np.clip(self.mid_s + dt, self.trace_s[0], self.trace_s[-1])
-        T_cam_base = (interpolate_poses(self.trace_s, self.trace, at) @ self.T_tcp_cam).inverse()
+        T_cam_base = (self.arm.at(self.mid_s + dt) @ self.T_tcp_cam).inverse()
         predicted = self.intrinsics.project(T_cam_base[self.observations.view].apply(self.board_in_base))
         residual = np.where(np.isfinite(predicted), predicted - self.observations.pixels, _FAR)
         return np.where(np.abs(residual) < _FAR, residual, _FAR)

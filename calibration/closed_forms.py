@@ -93,9 +93,13 @@ def disagreement(placed: SE3, T_fixture_board: SE3) -> NDArray[np.float64]:
 
 
 def mean_pose(poses: SE3) -> SE3:
-    """A robust mean of N poses: the median translation, and the rotation closest to all in the chordal
-    sense."""
-    return SE3(_nearest_rotation(poses.rotation.sum(axis=0)), np.median(poses.translation, axis=0))
+    """A robust mean of N poses: the median translation, and the mean rotation."""
+    return SE3(mean_rotation(poses.rotation), np.median(poses.translation, axis=0))
+
+
+def mean_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation (3, 3) closest to N rotations (N, 3, 3) in the chordal sense (Moakher 2002)."""
+    return _nearest_rotation(rotation.sum(axis=0))
 
 
 def _hand_eye(name: str, T_fixture_mount: SE3, T_cam_board: SE3) -> SE3 | None:

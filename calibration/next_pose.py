@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.board import BoardSpec
 from calibration.bundle import Bools, Floats, Observations
-from calibration.closed_forms import arm_reading
+from calibration.closed_forms import mean_rotation
 from calibration.detection import MIN_CORNERS
 from calibration.hand_eye import HandEyeResult
 from calibration.hand_eye_model import TRANSFORMS
@@ -148,9 +148,7 @@ def _worth(result: HandEyeResult, spec: BoardSpec, T_base_tcp: SE3, ids: np.ndar
 
 def _reason(result: HandEyeResult, T_base_tcp: SE3) -> str:
     """How the tool is turned against the views so far, in the tool's own axes."""
-    used = arm_reading(result.fit.state.T_base_tcp, "eye_in_hand").rotation
-    u, _, vt = np.linalg.svd(used.sum(axis=0))
-    mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    mean = mean_rotation(result.fit.state.T_base_tcp.rotation)
     turned = np.degrees(SE3(mean.T @ T_base_tcp.rotation, np.zeros(3)).as_rotvec())
     parts = [f"{value:+.0f} degrees about {axis}" for axis, value in zip("xyz", turned, strict=True)]
     return "the tool turned by " + ", ".join(parts) + " against the mean of the views so far"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.closed_forms import Mount
+from calibration.closed_forms import Mount, mean_rotation
 from calibration.words import axis_name
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3
@@ -39,8 +39,7 @@ class RotationSpread:
 
 def rotation_spread(T_base_tcp: SE3) -> RotationSpread:
     """Principal axes of the rotations of N poses about their mean orientation, in the tool's frame."""
-    u, _, vt = np.linalg.svd(T_base_tcp.rotation.sum(axis=0))
-    mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    mean = mean_rotation(T_base_tcp.rotation)
     about_mean = SE3(mean.T @ T_base_tcp.rotation, np.zeros_like(T_base_tcp.translation)).as_rotvec()
     about_mean = about_mean - about_mean.mean(axis=0)
     _, singular, axes = np.linalg.svd(about_mean, full_matrices=True)

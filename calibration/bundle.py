@@ -54,20 +54,14 @@ class Observations:
             view_count=len(detections),
         )
 
-    def take(self, views: NDArray[np.intp]) -> Observations:
-        """The views with these indices, in this order; one may come more than once."""
+    def take(self, views: Bools | NDArray[np.intp]) -> Observations:
+        """Some of the views, renumbered without gaps: a mask (view_count,), or indices in the order wanted,
+        one of which may come more than once."""
+        views = np.flatnonzero(views) if views.dtype == np.bool_ else np.asarray(views, np.intp)
         starts = np.searchsorted(self.view, np.arange(self.view_count + 1))
         corners = np.concatenate([np.arange(starts[v], starts[v + 1]) for v in views])
         renumbered = np.repeat(np.arange(len(views)), starts[views + 1] - starts[views])
         return Observations(renumbered, self.board[corners], self.pixels[corners], len(views))
-
-    def of_views(self, keep: Bools) -> Observations:
-        """Only the views where ``keep`` (view_count,) holds, renumbered without gaps."""
-        corners = keep[self.view]
-        renumbered = np.cumsum(keep) - 1
-        return Observations(
-            renumbered[self.view[corners]], self.board[corners], self.pixels[corners], int(keep.sum())
-        )
 
     def sum_by_view(self, values: Floats) -> Floats:
         """Sums values (P, ...) over each view's corners: (view_count, ...)."""

@@ -193,7 +193,7 @@ def calibrate_hand_eye(
     state, candidates = _best_start(start, T_cam_board, observations)
     used, state = _reject_outlier_views(state, observations)
     require_observable(T_base_tcp[used], mount)
-    kept = observations.of_views(used)
+    kept = observations.take(used)
     free = state.free(offset=moving is not None, camera=refine_camera)
     state = replace(state.take(used), scale=1.0)
     information = None
@@ -296,7 +296,7 @@ def leave_one_out(found: Fit, observations: Observations, T_cam_board: SE3) -> t
     millimetres, degrees = np.empty(count), np.empty(count)
     for left_out in range(count):
         others = np.arange(count) != left_out
-        trained, _ = found.again(found.state.take(others), observations.of_views(others))
+        trained, _ = found.again(found.state.take(others), observations.take(others))
         reading = arm_reading(found.state.T_base_tcp[left_out], found.state.mount)
         predicted = (reading @ trained.T_mount_cam).inverse() @ trained.T_fixture_board
         millimetres[left_out] = translation_error_mm(predicted, T_cam_board[left_out])

@@ -103,21 +103,21 @@ def calibrate_intrinsics(
     limit = 3.0 * np.median(view_rms) + 0.05
     if (view_rms > limit).any() and np.count_nonzero(view_rms <= limit) >= MIN_VIEWS:
         used = view_rms <= limit
-        kept = observations.of_views(used)
-        refit, solution = _refine(state.of_views(used), kept)
+        kept = observations.take(used)
+        refit, solution = _refine(state.take(used), kept)
         state = replace(state, K=refit.K, distortion=refit.distortion)
         state = state.with_poses_of(refit, used)
     intrinsics = Intrinsics(state.K, state.distortion, *image_size)
     residual = state.linearize(observations).residual
     corner_used = used[observations.view]
     rms = float(np.sqrt(np.mean(np.sum(residual[corner_used] ** 2, axis=1))))
-    aspect, aspect_sigma = _board_aspect(state.of_views(used), observations.of_views(used))
+    aspect, aspect_sigma = _board_aspect(state.take(used), observations.take(used))
     _check_result(state, solution, rms, used)
     return IntrinsicsResult(
         intrinsics=intrinsics,
         covariance=solution.covariance,
         rms_px=rms,
-        held_out_px=_held_out(state.of_views(used), observations.of_views(used)),
+        held_out_px=_held_out(state.take(used), observations.take(used)),
         view_rms_px=observations.view_rms(residual),
         used=used,
         coverage=_coverage(observations.pixels[corner_used], image_size),
@@ -206,8 +206,8 @@ class _State:
         distortion, aspect = self.distortion + shared[4:-1], self.aspect + float(shared[-1])
         return _State(K, distortion, self.T_cam_board @ SE3.exp(own), aspect)
 
-    def of_views(self, keep: Bools) -> _State:
-        return replace(self, T_cam_board=self.T_cam_board[keep])
+    def take(self, views: Bools) -> _State:
+        return replace(self, T_cam_board=self.T_cam_board[views])
 
     def with_poses_of(self, other: _State, where: Bools) -> _State:
         rotation, translation = self.T_cam_board.rotation.copy(), self.T_cam_board.translation.copy()
@@ -282,8 +282,8 @@ def _held_out(state: _State, observations: Observations) -> float:
         test = views % _FOLDS == fold
         if np.count_nonzero(~test) < MIN_VIEWS - 1:
             continue
-        trained, _ = _refine(state.of_views(~test), observations.of_views(~test))
-        unseen = observations.of_views(test)
+        trained, _ = _refine(state.take(~test), observations.take(~test))
+        unseen = observations.take(test)
         posed = replace(trained, T_cam_board=state.T_cam_board[test])
         frozen = np.zeros(len(state.free()), bool)
         _, solution = solve(posed, unseen, 0.1, np.full((unseen.view_count, 6), np.inf), frozen)

@@ -176,7 +176,7 @@ def _refined(
     free = state.free(offset=True)
     information = np.zeros((len(free), len(free)))
     information[TRANSFORMS, TRANSFORMS] = np.linalg.inv(covariance + _EXACT**2 * np.eye(len(covariance)))
-    observations = problem.observations.of_views(used)
+    observations = problem.observations.take(used)
     found = fit(replace(state, expected=state), observations, free, information)
     place = int(np.count_nonzero(free[:SCALE]))  # after the transforms: the scale is not free
     stretches = found.jackknife_variance(observations, min(_STRETCHES, observations.view_count // 2))

@@ -8,14 +8,13 @@ from typing import overload
 
 import numpy as np
 
-from calibration import html
 from calibration.polarizer import PolarizerResult, calibrate_polarizer
 from calibration.polarizer_report import polarizer_section
 from calibration.polarizer_states import Progress
 from calibration.records import PolarizerRecord, Source
 from calibration.response_file import write_response
 from calibration.result import Calibration
-from calibration.steps import report_path
+from calibration.steps import write_report
 from dataset.polarimetry import Raw
 from dataset.session import Session
 
@@ -38,7 +37,7 @@ def add_polarizer(
         CalibrationError: the intrinsics are of another camera; as `calibrate_polarizer`.
         SessionError: the session cannot be read.
     """
-    known = Calibration.load(calibration) if calibration.exists() else Calibration()
+    known = Calibration.load_or_new(calibration)
     with Session.open(session) as opened:
         camera = opened.camera
         if known.intrinsics is not None:
@@ -47,8 +46,7 @@ def add_polarizer(
     file, digest = write_response(calibration, result.response)
     record = PolarizerRecord.of(result, camera, file, digest, (Source.of(session),))
     known.merged(Calibration(polarizer=record)).save(calibration)
-    page = html.page("Calibration report", str(session), [polarizer_section(result)])
-    report_path(calibration, "polarizer").write_text(page, encoding="utf-8")
+    write_report(calibration, "polarizer", str(session), [polarizer_section(result)])
     return record
 
 

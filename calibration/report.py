@@ -1,4 +1,5 @@
-"""The calibration report: one self-contained HTML page, pictures before numbers."""
+"""What the report shows of the camera, of the hand-eye transform and of the time offset: pictures before
+numbers."""
 
 from __future__ import annotations
 
@@ -9,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import html, plots, view_plots
-from calibration.board import BoardSpec
 from calibration.detection import intensity_image
 from calibration.hand_eye import HandEyeResult
 from calibration.intrinsics import IntrinsicsResult
@@ -29,62 +29,20 @@ class ViewPicture:
     view: int
 
 
-def intrinsics_report(
-    spec: BoardSpec,
+def intrinsics_section(
     result: IntrinsicsResult,
     frames: Sequence[int],
     pictures: Sequence[ViewPicture] = (),
     warnings: Sequence[str] = (),
-    subtitle: str = "",
 ) -> str:
-    """The page of the intrinsics.
+    """How well a lens model explains the corners, and the camera's parameters.
 
     Args:
-        spec: the board.
         result: of N views.
         frames: (N,) the session's frame of every view, which names it.
         pictures: of some views, to draw the corners on.
         warnings: in words, to be shown first.
-        subtitle: of the page.
     """
-    return _page(spec, _intrinsics(result, frames, pictures, warnings), subtitle)
-
-
-def hand_eye_report(
-    spec: BoardSpec,
-    result: HandEyeResult,
-    frames: Sequence[int],
-    pictures: Sequence[ViewPicture] = (),
-    intervals: Intervals | None = None,
-    advice: NextPose | None = None,
-    warnings: Sequence[str] = (),
-    subtitle: str = "",
-) -> str:
-    """The page of the hand-eye transform.
-
-    Args:
-        spec, result, frames, pictures, warnings, subtitle: as in `intrinsics_report`.
-        intervals: by the bootstrap.
-        advice: the view to take next.
-    """
-    return _page(spec, _hand_eye(result, frames, pictures, intervals, advice, warnings), subtitle)
-
-
-def time_offset_report(spec: BoardSpec, result: TimeOffsetResult, subtitle: str = "") -> str:
-    """The page of the time offset."""
-    return _page(spec, _time_offset(result), subtitle)
-
-
-def _page(spec: BoardSpec, section: str, subtitle: str) -> str:
-    return html.page("Calibration report", subtitle, [section], f"Board: {spec}.")
-
-
-def _intrinsics(
-    result: IntrinsicsResult,
-    frames: Sequence[int],
-    pictures: Sequence[ViewPicture],
-    warnings: Sequence[str],
-) -> str:
     camera, sigma = result.intrinsics, result.sigma
     size = camera.height, camera.width
     outlier = ~result.used[result.view]
@@ -163,14 +121,21 @@ def _intrinsics(
     )
 
 
-def _hand_eye(
+def hand_eye_section(
     result: HandEyeResult,
     frames: Sequence[int],
-    pictures: Sequence[ViewPicture],
-    intervals: Intervals | None,
-    advice: NextPose | None,
-    warnings: Sequence[str],
+    pictures: Sequence[ViewPicture] = (),
+    intervals: Intervals | None = None,
+    advice: NextPose | None = None,
+    warnings: Sequence[str] = (),
 ) -> str:
+    """Where the camera is on the tool or in the base, and how well the views agree on it.
+
+    Args:
+        result, frames, pictures, warnings: as in `intrinsics_section`.
+        intervals: by the bootstrap.
+        advice: the view to take next.
+    """
     outlier = ~result.used[result.view]
     width, height = result.board_size_m
     corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]])
@@ -262,7 +227,8 @@ def _hand_eye(
     )
 
 
-def _time_offset(result: TimeOffsetResult) -> str:
+def time_offset_section(result: TimeOffsetResult) -> str:
+    """How sharply the pictures tell the delay, and what each frame says."""
     order = np.argsort(result.speed_px_s)
     labels = [f"{result.speed_px_s[i]:.0f}" for i in order]
     apart = np.abs(1e3 * (result.frame_offset_s[order] - result.offset_s))

@@ -180,6 +180,15 @@ class Calibration:
             return found
         return replace(found, polarizer=replace(found.polarizer, folder=path.parent))
 
+    @staticmethod
+    def load_or_new(path: str | Path) -> Calibration:
+        """Reads calibration.json; an empty calibration where there is no file yet.
+
+        Raises:
+            CalibrationError: as `from_json`.
+        """
+        return Calibration.load(path) if Path(path).exists() else Calibration()
+
 
 def _encode(value: Any) -> Any:
     if isinstance(value, SE3):

@@ -6,12 +6,13 @@ The report of a step lies beside the calibration: calibration.json gets calibrat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from calibration import remarks
+from calibration import html, remarks
 from calibration.board import BoardSpec
 from calibration.closed_forms import Mount
 from calibration.hand_eye import HandEyeResult
@@ -23,7 +24,7 @@ from calibration.records import (
     Source,
     TimeOffsetRecord,
 )
-from calibration.report import ViewPicture, hand_eye_report, intrinsics_report, time_offset_report
+from calibration.report import ViewPicture, hand_eye_section, intrinsics_section, time_offset_section
 from calibration.resampling import Intervals, bootstrap
 from calibration.result import Calibration
 from calibration.sessions import (
@@ -55,7 +56,7 @@ def add_intrinsics(
         CalibrationError: as `intrinsics_from_session`.
         SessionError: the session cannot be read.
     """
-    known = Calibration.load(calibration) if calibration.exists() else Calibration()
+    known = Calibration.load_or_new(calibration)
     with Session.open(session) as opened:
         found = detect_session(opened, spec, on_progress)
         found = [found[i] for i in select_views([d for _, d in found], spec)]
@@ -68,8 +69,8 @@ def add_intrinsics(
     if known.polarizer is not None and known.polarizer.camera_serial not in (None, camera.serial):
         kept = replace(kept, polarizer=None)
     kept.merged(Calibration(board=spec, intrinsics=record)).save(calibration)
-    page = intrinsics_report(spec, result, frames, pictures, warnings, str(session))
-    report_path(calibration, "intrinsics").write_text(page, encoding="utf-8")
+    section = intrinsics_section(result, frames, pictures, warnings)
+    write_report(calibration, "intrinsics", str(session), [section], spec)
     return record
 
 
@@ -137,10 +138,8 @@ def add_hand_eye(
         record = FixedCameraRecord.of(result, (source,), warnings)
         known.merged(replace(changed, fixed_camera=record)).save(calibration)
     step = HandEyeStep(record, refined, bootstrap(result), _advice(result, spec, reachable))
-    page = hand_eye_report(
-        spec, result, frames, pictures, step.intervals, step.advice, warnings, str(session)
-    )
-    report_path(calibration, "hand-eye").write_text(page, encoding="utf-8")
+    section = hand_eye_section(result, frames, pictures, step.intervals, step.advice, warnings)
+    write_report(calibration, "hand-eye", str(session), [section], spec)
     return step
 
 
@@ -189,14 +188,22 @@ def add_time_offset(
         result = time_offset_from_session(opened, spec, known.intrinsics, known.hand_eye, found)
     record = TimeOffsetRecord.of(result, (Source.of(session),))
     known.merged(Calibration(time_offset=record)).save(calibration)
-    page = time_offset_report(spec, result, str(session))
-    report_path(calibration, "time-offset").write_text(page, encoding="utf-8")
+    write_report(calibration, "time-offset", str(session), [time_offset_section(result)], spec)
     return record
 
 
 def report_path(calibration: Path, step: str) -> Path:
     """Where the report of a step lies."""
     return calibration.with_name(f"{calibration.stem}-{step}.html")
+
+
+def write_report(
+    calibration: Path, step: str, source: str, sections: Sequence[str], board: BoardSpec | None = None
+) -> None:
+    """Writes the report of a step: what it came from, its HTML sections, and the board, if one was seen."""
+    footer = "" if board is None else f"Board: {board}."
+    page = html.page("Calibration report", source, sections, footer)
+    report_path(calibration, step).write_text(page, encoding="utf-8")
 
 
 def _pictures(session: Session, views: Detections) -> list[ViewPicture]:

@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration import html
 from calibration.fusion import fuse_poses
 from calibration.object_observability import Tip
 from calibration.object_pose import ObjectPoseResult, register_points
 from calibration.records import ObjectPoseRecord, Source, ToolTipRecord
 from calibration.result import Calibration
-from calibration.steps import report_path
+from calibration.steps import write_report
 from calibration.touch_report import TouchedObject, object_section, tool_tip_section
 from calibration.touches import KnownTip, Touches, read_points, tool_tip_from_session, touched_points
 from dataset.errors import CalibrationError
@@ -39,9 +38,8 @@ def add_tool_tip(session: Path, calibration: Path) -> ToolTipRecord:
     with Session.open(session) as opened:
         result = tool_tip_from_session(opened)
         record = ToolTipRecord.of(result, opened.tcp_offset, (Source.of(session),))
-    _known(calibration).merged(Calibration(tool_tip=record)).save(calibration)
-    page = html.page("Calibration report", str(session), [tool_tip_section(result)])
-    report_path(calibration, "tool-tip").write_text(page, encoding="utf-8")
+    Calibration.load_or_new(calibration).merged(Calibration(tool_tip=record)).save(calibration)
+    write_report(calibration, "tool-tip", str(session), [tool_tip_section(result)])
     return record
 
 
@@ -51,7 +49,7 @@ def known_tip(calibration: Path, guess: ArrayLike | None, ball_m: float = 0.0) -
     Raises:
         CalibrationError: the tip was not calibrated, and there is no guess.
     """
-    record = _known(calibration).tool_tip
+    record = Calibration.load_or_new(calibration).tool_tip
     if record is not None:
         offset = record.tcp_offset if len(record.tcp_offset) else None
         return KnownTip(record.tip_in_tcp, record.covariance, ball_m, offset)
@@ -100,18 +98,13 @@ def add_object(
         results.append(result)
     sources = tuple(Source.of(path) for path in paths)
     record = _fused(results, sources, symmetry_axis)
-    _known(calibration).merged(Calibration(objects={name: record})).save(calibration)
+    Calibration.load_or_new(calibration).merged(Calibration(objects={name: record})).save(calibration)
     sections = [
         object_section(name, TouchedObject(result, t.points, vertices, faces))
         for result, t in zip(results, found, strict=True)
     ]
-    page = html.page("Calibration report", ", ".join(map(str, paths)), sections)
-    report_path(calibration, f"object-{name}").write_text(page, encoding="utf-8")
+    write_report(calibration, f"object-{name}", ", ".join(map(str, paths)), sections)
     return record
-
-
-def _known(calibration: Path) -> Calibration:
-    return Calibration.load(calibration) if calibration.exists() else Calibration()
 
 
 def _read(path: Path, calibration: Path, tip: KnownTip | None) -> Touches:

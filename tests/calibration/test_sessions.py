@@ -13,9 +13,10 @@ from calibration import (
     camera_poses,
     detect_session,
     hand_eye_from_session,
+    html,
     intrinsics_from_session,
 )
-from calibration.report import ViewPicture, hand_eye_report, intrinsics_report
+from calibration.report import ViewPicture, hand_eye_section, intrinsics_section
 from calibration.sessions import arm_trace, rest_pose
 from calibration.touches import KnownTip, read_points, touched_points
 from dataset.errors import CalibrationError
@@ -116,15 +117,16 @@ def test_points_may_be_separated_by_commas_and_carry_comments(tmp_path):
     np.testing.assert_allclose(read_points(path), [[0.1, 0.2, 0.3], [1, 2, 3]])
 
 
-def test_the_report_is_one_file_with_pictures_first(world, stills, calibrated):
+def test_the_report_is_one_file_with_pictures_first(stills, calibrated):
     camera, _, hand_eye = calibrated
     with Session.open(stills[0]) as session:
         shown = [ViewPicture(session.raw(0), session.camera.mosaic, 0)]
     frames = range(len(stills[1]))
-    for page in (
-        intrinsics_report(world.spec, camera, frames, shown),
-        hand_eye_report(world.spec, hand_eye, frames, shown),
+    for section in (
+        intrinsics_section(camera, frames, shown),
+        hand_eye_section(hand_eye, frames, shown),
     ):
+        page = html.page("Calibration report", "", [section])
         assert "data:image/" in page
         assert "http" not in page.replace("http://www.w3.org/2000/svg", "")
         first_picture, first_number = page.index("<svg"), page.index('<div class="tiles"')

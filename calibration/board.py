@@ -145,8 +145,7 @@ class BoardSpec:
         if ids.size and (ids.min() < 0 or ids.max() >= self.corner_count):
             raise CalibrationError(
                 f"board: corner id {int(ids.max())} does not exist on a {self.squares_x}x{self.squares_y}"
-                " board"
-                f" with {self.corner_count} corners; check squares_x and squares_y"
+                f" board with {self.corner_count} corners; check squares_x and squares_y"
             )
         if self.kind == "aprilgrid":
             tags, corner = np.divmod(ids, 4)

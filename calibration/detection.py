@@ -102,8 +102,7 @@ def explain_missing_board(image: NDArray[np.generic], spec: BoardSpec) -> str:
         if found.max() >= spec.marker_count:
             return (
                 f"markers up to id {found.max()} are visible but a {spec.squares_x}x{spec.squares_y} board"
-                " has only"
-                f" ids 0-{spec.marker_count - 1}: squares_x or squares_y is too small"
+                f" has only ids 0-{spec.marker_count - 1}: squares_x or squares_y is too small"
             )
         return (
             f"{len(found)} markers of {spec.dictionary} are visible but do not lie as on a"

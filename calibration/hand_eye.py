@@ -350,10 +350,8 @@ def _reject_outlier_views(state: HandEyeState, observations: Observations) -> tu
     if typical_m > _NO_ARM_M or typical_rad > _NO_ARM_RAD:
         raise CalibrationError(
             f"hand-eye: no common transform fits, the arm would have to be off by {1000 * typical_m:.0f} mm"
-            " and"
-            f" {np.degrees(typical_rad):.1f} degrees in a typical view; check that poses are base<-tcp (not"
-            " inverted), in"
-            " metres, and belong to the pictures"
+            f" and {np.degrees(typical_rad):.1f} degrees in a typical view; check that poses are base<-tcp"
+            " (not inverted), in metres, and belong to the pictures"
         )
     # Judged by the picture, with the arm taken at its word: a view with few corners is not an outlier for
     # that.
@@ -363,8 +361,8 @@ def _reject_outlier_views(state: HandEyeState, observations: Observations) -> tu
     if np.count_nonzero(used) < max(MIN_POSES, count // 2):
         raise CalibrationError(
             f"hand-eye: {count - np.count_nonzero(used)} of {count} views contradict the others; check that"
-            " the"
-            " board and the base did not move, and that arm poses are base<-tcp at the time of each picture"
+            " the board and the base did not move, and that arm poses are base<-tcp at the time of each"
+            " picture"
         )
     return used, state
 

@@ -338,21 +338,18 @@ def _check_result(state: _State, solution: Solution, rms: float, used: Bools) ->
     if not rms < _MAX_RMS_PX:
         raise CalibrationError(
             f"intrinsics: corners are {rms:.1f} px from any lens' prediction; is the board flat, and"
-            " described"
-            " correctly (squares_x, squares_y, marker_m / square_m)?"
+            " described correctly (squares_x, squares_y, marker_m / square_m)?"
         )
     normals = state.T_cam_board[used].rotation[..., 2]
     tilt = np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
     if tilt < _MIN_TILT_DEG:
         raise CalibrationError(
             f"intrinsics: the board's tilt varies by only {tilt:.1f} degrees, so focal length and distance"
-            " cannot be"
-            " told apart; record views tilted by 20-40 degrees about both axes"
+            " cannot be told apart; record views tilted by 20-40 degrees about both axes"
         )
     sigma = np.sqrt(np.diagonal(solution.covariance)[:2]) / np.diagonal(state.K)[:2]
     if not (sigma < _MAX_FOCAL_SIGMA).all():
         raise CalibrationError(
             f"intrinsics: the focal length is known to only {100 * sigma.max():.1f} %; add views with"
-            " stronger tilt"
-            " and closer to the image's borders"
+            " stronger tilt and closer to the image's borders"
         )

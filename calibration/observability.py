@@ -78,8 +78,7 @@ def require_observable(T_base_tcp: SE3, mount: Mount = "eye_in_hand") -> Rotatio
     if distinct < MIN_POSES:
         raise CalibrationError(
             f"hand-eye: only {distinct} of {len(T_base_tcp)} arm poses differ by more than 1 mm or 0.3"
-            " degrees;"
-            " the same pose repeated adds nothing: record different poses"
+            " degrees; the same pose repeated adds nothing: record different poses"
         )
     spread = rotation_spread(T_base_tcp)
     if spread.rms_deg[0] < MIN_SPREAD_DEG:
@@ -92,10 +91,9 @@ def require_observable(T_base_tcp: SE3, mount: Mount = "eye_in_hand") -> Rotatio
         first, second = spread.axes[0], spread.axes[1]
         raise CalibrationError(
             f"hand-eye: the tool rotated about one axis only ({axis_name(first)}, {spread.rms_deg[0]:.1f}"
-            " degrees rms;"
-            f" {spread.rms_deg[1]:.2f} about {axis_name(second)}), so the {carried}'s position along that"
-            " axis is not"
-            f" observable; add views tilted by 15-30 degrees about {axis_name(second)} of the tool"
+            f" degrees rms; {spread.rms_deg[1]:.2f} about {axis_name(second)}), so the {carried}'s position"
+            f" along that axis is not observable; add views tilted by 15-30 degrees about {axis_name(second)}"
+            " of the tool"
         )
     return spread
 

@@ -38,9 +38,8 @@ FORMAT = "s2p3-calibration"
 VERSION = "1.2"
 CONVENTIONS = (
     "T_a_b (4x4) maps points of frame b to frame a; metres, radians, seconds; intrinsics in pixels of the raw"
-    " mosaic, pixel centres at integer coordinates, OpenCV's distortion order; the covariance of a"
-    " transform is"
-    " that of the twist [rho, phi] (m, rad) in T @ exp(twist)"
+    " mosaic, pixel centres at integer coordinates, OpenCV's distortion order; the covariance of a transform"
+    " is that of the twist [rho, phi] (m, rad) in T @ exp(twist)"
 )
 
 

@@ -101,8 +101,7 @@ def estimate_time_offset(
     if abs(offset) > RANGE_S - 1.5 * _SCAN_STEP_S:
         raise CalibrationError(
             f"time offset: no offset within {RANGE_S:g} s explains the pictures; check that the clocks were"
-            " fitted and"
-            " that the hand-eye calibration belongs to this rig"
+            " fitted and that the hand-eye calibration belongs to this rig"
         )
     for _ in range(30):
         step = problem.gauss_newton_step(offset)
@@ -112,9 +111,8 @@ def estimate_time_offset(
     frame = problem.frames(offset)
     if np.count_nonzero(frame.used) < MIN_FRAMES:
         raise CalibrationError(
-            f"time offset: only {np.count_nonzero(frame.used)} frames lie within the arm's trace; record"
-            " the trace from"
-            " before the first to after the last frame"
+            f"time offset: only {np.count_nonzero(frame.used)} frames lie within the arm's trace; record the"
+            " trace from before the first to after the last frame"
         )
     # The frames' errors are not independent corner by corner (a hand-eye error moves all corners of a
     # frame), so the scatter of whole frames is what the uncertainty is taken from (a clustered, "sandwich"
@@ -126,8 +124,7 @@ def estimate_time_offset(
     if speed < _MIN_SPEED_PX_S or not sigma < _MAX_SIGMA_S:
         raise CalibrationError(
             f"time offset: the camera moved too little in {np.count_nonzero(frame.used)} frames to tell"
-            " (sigma"
-            f" {1e3 * sigma:.1f} ms; median corner speed {speed:.0f} px/s); record the board while the"
+            f" (sigma {1e3 * sigma:.1f} ms; median corner speed {speed:.0f} px/s); record the board while the"
             " arm swings at 0.1-0.25 m/s, changing direction"
         )
     with np.errstate(divide="ignore", invalid="ignore"):

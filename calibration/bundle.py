@@ -27,6 +27,7 @@ _GAUSSIAN_SHRINKAGE = 0.8449
 """Mean of weight * r^2 / sigma^2 over Gaussian corners: 1/4 of the integral of x exp(-x/2) / sqrt(1 +
 x/9)."""
 _MAX_STEPS = 60
+_FX_FY_CX_CY = ([0, 1, 0, 1], [0, 1, 2, 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,6 +314,18 @@ def _inverse_scaled(matrix: Floats) -> Floats:
     return (
         np.linalg.pinv(matrix * scale[:, None] * scale, rcond=1e-14, hermitian=True) * scale[:, None] * scale
     )
+
+
+def camera_parameters(K: Floats, distortion: Floats) -> Floats:
+    """(4 + n,) fx, fy, cx, cy and the n distortion coefficients, ordered as in a camera's covariance."""
+    return np.concatenate([K[_FX_FY_CX_CY], distortion])
+
+
+def camera_moved(K: Floats, distortion: Floats, step: Floats) -> tuple[Floats, Floats]:
+    """K and distortion after a step (4 + n,) of the `camera_parameters`."""
+    moved = K.copy()
+    moved[_FX_FY_CX_CY] += step[:4]
+    return moved, distortion + step[4:]
 
 
 def project_with_derivatives(points: Floats, K: Floats, distortion: Floats) -> tuple[Floats, Floats, Floats]:

@@ -18,6 +18,8 @@ from calibration.bundle import (
     Linearization,
     Observations,
     Solution,
+    camera_moved,
+    camera_parameters,
     cross_matrix,
     jackknife_variance,
     project_with_derivatives,
@@ -84,11 +86,6 @@ class HandEyeState:
         return self.arm_error
 
     @property
-    def camera_parameters(self) -> Floats:
-        """(4 + n,) fx fy cx cy distortion."""
-        return np.concatenate([self.camera.K[[0, 1, 0, 1], [0, 1, 2, 2]], self.camera.distortion])
-
-    @property
     def shared_deviation(self) -> Floats:
         before = self.expected
         if before is None:
@@ -98,7 +95,8 @@ class HandEyeState:
                 (before.T_mount_cam.inverse() @ self.T_mount_cam).log(),
                 (before.T_fixture_board.inverse() @ self.T_fixture_board).log(),
                 [self.scale - before.scale, self.offset_s - before.offset_s],
-                self.camera_parameters - before.camera_parameters,
+                camera_parameters(self.camera.K, self.camera.distortion)
+                - camera_parameters(before.camera.K, before.camera.distortion),
             ]
         )
 
@@ -153,9 +151,7 @@ class HandEyeState:
             arm_error=self.arm_error + own,
         )
         if shared[CAMERA].any():
-            K = self.camera.K.copy()
-            K[[0, 1, 0, 1], [0, 1, 2, 2]] += shared[CAMERA][:4]
-            distortion = self.camera.distortion + shared[CAMERA][4:]
+            K, distortion = camera_moved(self.camera.K, self.camera.distortion, shared[CAMERA])
             step = replace(step, camera=replace(self.camera, K=K, distortion=distortion))
         return step.at_offset(self.offset_s + float(shared[OFFSET])) if shared[OFFSET] else step
 

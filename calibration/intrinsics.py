@@ -15,6 +15,8 @@ from calibration.bundle import (
     Linearization,
     Observations,
     Solution,
+    camera_moved,
+    camera_parameters,
     cross_matrix,
     project_with_derivatives,
     solve,
@@ -176,7 +178,7 @@ class _State:
     @property
     def shared_deviation(self) -> Floats:
         """Against a prior about zero: only differences of parameters have one."""
-        return np.concatenate([self.K[[0, 1, 0, 1], [0, 1, 2, 2]], self.distortion, [self.aspect - 1.0]])
+        return np.append(camera_parameters(self.K, self.distortion), self.aspect - 1.0)
 
     def free(self, aspect: bool = False) -> Bools:
         """(S,) the camera, and the board's aspect if asked for."""
@@ -201,10 +203,8 @@ class _State:
         )
 
     def moved(self, shared: Floats, own: Floats) -> _State:
-        K = self.K.copy()
-        K[[0, 1, 0, 1], [0, 1, 2, 2]] += shared[:4]
-        distortion, aspect = self.distortion + shared[4:-1], self.aspect + float(shared[-1])
-        return _State(K, distortion, self.T_cam_board @ SE3.exp(own), aspect)
+        K, distortion = camera_moved(self.K, self.distortion, shared[:-1])
+        return _State(K, distortion, self.T_cam_board @ SE3.exp(own), self.aspect + float(shared[-1]))
 
     def take(self, views: Bools) -> _State:
         return replace(self, T_cam_board=self.T_cam_board[views])

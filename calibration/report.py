@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import html, plots, view_plots
+from calibration.bundle import camera_parameters
 from calibration.detection import intensity_image
 from calibration.hand_eye import HandEyeResult
 from calibration.intrinsics import IntrinsicsResult
@@ -48,7 +49,7 @@ def intrinsics_section(
     outlier = ~result.used[result.view]
     field, magnify = plots.residual_field(result.pixels, result.residual_px, outlier, size)
     names = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
-    values = [*camera.K[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion]
+    values = camera_parameters(camera.K, camera.distortion)
     rows = [
         [
             name,

@@ -200,7 +200,7 @@ def jackknife_variance(
     moved = []
     for stretch in np.array_split(np.arange(observations.view_count), groups):
         rest = total - information[stretch].sum(axis=0)
-        moved.append(_solve_scaled(rest, gradient[stretch].sum(axis=0)))
+        moved.append(solve_scaled(rest, gradient[stretch].sum(axis=0)))
     spread = np.sum((np.stack(moved) - np.mean(moved, axis=0)) ** 2, axis=0) * (groups - 1) / groups
     inverse = _inverse_scaled(total)
     by_prior = np.diagonal(inverse @ prior @ inverse)
@@ -281,7 +281,7 @@ class _Problem:
         eliminated = np.linalg.solve(own, np.concatenate([cross, normal.gradient_own[..., None]], axis=2))
         reduced = shared - np.einsum("vls,vlt->st", cross, eliminated[..., :-1])
         gradient = normal.gradient_shared[free] - np.einsum("vls,vl->s", cross, eliminated[..., -1])
-        step_free = -_solve_scaled(reduced, gradient)
+        step_free = -solve_scaled(reduced, gradient)
         step_own = -eliminated[..., -1] - eliminated[..., :-1] @ step_free
         step_shared = np.zeros(len(free))
         step_shared[free] = step_free
@@ -303,17 +303,18 @@ def _damped(matrix: Floats, damping: float) -> Floats:
     return matrix + (damping * diagonal + 1e-12)[..., None] * np.eye(matrix.shape[-1])
 
 
-def _solve_scaled(matrix: Floats, vector: Floats) -> Floats:
-    # Focal lengths (1e3) beside distortion coefficients (1e-2): equilibrate before solving.
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
-    return scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * vector, rcond=1e-14)[0]
-
-
 def _inverse_scaled(matrix: Floats) -> Floats:
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
     return (
         np.linalg.pinv(matrix * scale[:, None] * scale, rcond=1e-14, hermitian=True) * scale[:, None] * scale
     )
+
+
+def solve_scaled(matrix: Floats, vector: Floats) -> Floats:
+    """x (S,) with matrix (S, S) x = vector (S,); along what a singular matrix leaves open x is zero."""
+    # Focal lengths (1e3) beside distortion coefficients (1e-2): equilibrate before solving.
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
+    return scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * vector, rcond=1e-14)[0]
 
 
 def camera_parameters(K: Floats, distortion: Floats) -> Floats:

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.bundle import cross_matrix, project_with_derivatives
+from calibration.bundle import cross_matrix, project_with_derivatives, solve_scaled
 from calibration.closed_forms import Mount, arm_reading, closed_forms, disagreement, ransac
 from calibration.observability import RotationSpread, require_observable
 from calibration.variance_components import NoiseSource, covariances, estimate_sigmas, student_weights
@@ -217,7 +217,7 @@ def refine(
             weighted = np.swapaxes(J, 1, 2) @ (information * weight[:, None, None])
             normal = np.sum(weighted @ J, axis=0)
             step = np.zeros(_UNKNOWNS)
-            step[free] = -_solve(normal, np.sum(weighted @ residual[..., None], axis=0)[:, 0])
+            step[free] = -solve_scaled(normal, np.sum(weighted @ residual[..., None], axis=0)[:, 0])
             unknowns = unknowns.moved(step)
             residual, by_unknowns, by_arm, velocity = pairs.linearize(unknowns)
             if np.abs(step[:_TRANSFORMS]).max() < 1e-8:
@@ -288,11 +288,6 @@ def _by_right(pose: SE3) -> Floats:
     matrix[:, :3, :3] = pose.rotation
     matrix[:, 3:, 3:] = np.eye(3)
     return matrix
-
-
-def _solve(normal: Floats, gradient: Floats) -> Floats:
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
-    return np.asarray(scale * np.linalg.lstsq(normal * scale[:, None] * scale, scale * gradient, None)[0])
 
 
 def start_from(reading: SE3, T_cam_board: SE3, scale_known: bool, rng: np.random.Generator) -> Unknowns:

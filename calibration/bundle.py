@@ -338,10 +338,3 @@ def project_with_derivatives(points: Floats, K: Floats, distortion: Floats) -> t
     J = J.reshape(len(points), 2, -1)
     by_camera = np.asarray(J[..., 6 : 10 + len(distortion)], np.float64)
     return np.asarray(pixels[:, 0], np.float64), np.asarray(J[..., 3:6], np.float64), by_camera
-
-
-def cross_matrix(v: Floats) -> Floats:
-    """[v]x of vectors (..., 3): (..., 3, 3) with [v]x w = v x w."""
-    zero = np.zeros_like(v[..., 0])
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3)

@@ -20,7 +20,6 @@ from calibration.bundle import (
     Solution,
     camera_moved,
     camera_parameters,
-    cross_matrix,
     jackknife_variance,
     project_with_derivatives,
     solve,
@@ -28,7 +27,7 @@ from calibration.bundle import (
 from calibration.closed_forms import Mount
 from calibration.streams import ArmTrace
 from dataset.intrinsics import Intrinsics
-from dataset.transforms import SE3
+from dataset.transforms import SE3, cross_matrix
 
 TRANSFORMS = slice(0, 12)
 SCALE = 12

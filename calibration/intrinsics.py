@@ -17,14 +17,13 @@ from calibration.bundle import (
     Solution,
     camera_moved,
     camera_parameters,
-    cross_matrix,
     project_with_derivatives,
     solve,
 )
 from calibration.detection import MIN_CORNERS, Detection
 from dataset.errors import CalibrationError
 from dataset.intrinsics import Intrinsics
-from dataset.transforms import SE3
+from dataset.transforms import SE3, cross_matrix
 
 MIN_VIEWS = 5
 _MIN_TILT_DEG = 10.0

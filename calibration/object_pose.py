@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from calibration.fusion import turned_alike
 from calibration.object_observability import Tip, describe, openness, turns_that_fit
-from calibration.robot_world import adjoint
 from calibration.surface_fit import Surface, coarse_fit, finest_fit
 from calibration.words import axis_name
 from dataset.errors import CalibrationError
-from dataset.transforms import SE3
+from dataset.transforms import SE3, adjoint
 
 Floats = NDArray[np.float64]
 

@@ -14,13 +14,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.bundle import cross_matrix, project_with_derivatives, solve_scaled
+from calibration.bundle import project_with_derivatives, solve_scaled
 from calibration.closed_forms import Mount, arm_reading, closed_forms, disagreement, ransac
 from calibration.observability import RotationSpread, require_observable
 from calibration.variance_components import NoiseSource, covariances, estimate_sigmas, student_weights
 from dataset.errors import CalibrationError
 from dataset.intrinsics import Intrinsics
-from dataset.transforms import SE3, matrix_to_rotvec
+from dataset.transforms import SE3, adjoint, cross_matrix, matrix_to_rotvec
 
 Floats = NDArray[np.float64]
 
@@ -263,14 +263,6 @@ def pose_covariance(
         J = np.concatenate([by_point, by_point @ by_turn], axis=2).reshape(-1, 6)
         covariance[view] = pixel_sigma**2 * np.linalg.inv(J.T @ J)
     return covariance
-
-
-def adjoint(pose: SE3) -> Floats:
-    """(..., 6, 6) with T exp(x) = exp(Ad x) T for twists x = [rho, phi]. Solà et al. 2018, eq. 175."""
-    matrix = np.zeros((*pose.batch, 6, 6))
-    matrix[..., :3, :3] = matrix[..., 3:, 3:] = pose.rotation
-    matrix[..., :3, 3:] = cross_matrix(pose.translation) @ pose.rotation
-    return matrix
 
 
 def _by_left(pose: SE3) -> Floats:

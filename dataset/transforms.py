@@ -252,7 +252,7 @@ def translation_error_mm(a: SE3, b: SE3) -> Floats:
 def rotvec_to_matrix(rotvec: Floats) -> Floats:
     """Rodrigues' formula: rotation vectors (..., 3), radians, to matrices (..., 3, 3)."""
     first, second, _ = _exponential_coefficients(rotvec)
-    skew = _skew(rotvec)
+    skew = cross_matrix(rotvec)
     return np.eye(3) + first[..., None, None] * skew + second[..., None, None] * (skew @ skew)
 
 
@@ -264,6 +264,21 @@ def matrix_to_rotvec(rotation: Floats) -> Floats:
     small = sine < _SERIES_BELOW
     scale = np.where(small, 2.0 + sine**2 / 3.0, 2.0 * np.arctan2(sine, scalar) / np.where(small, 1.0, sine))
     return scale[..., None] * vector
+
+
+def cross_matrix(v: Floats) -> Floats:
+    """[v]x of vectors (..., 3): (..., 3, 3) with [v]x w = v x w."""
+    zero = np.zeros_like(v[..., 0])
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3)
+
+
+def adjoint(pose: SE3) -> Floats:
+    """(..., 6, 6) with T exp(x) = exp(Ad x) T for twists x = [rho, phi]. Solà et al. 2018, eq. 175."""
+    matrix = np.zeros((*pose.batch, 6, 6))
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = pose.rotation
+    matrix[..., :3, 3:] = cross_matrix(pose.translation) @ pose.rotation
+    return matrix
 
 
 def _check_rotation(rotation: Floats) -> None:
@@ -285,12 +300,6 @@ def _broadcast(rotation: Floats, translation: ArrayLike) -> SE3:
     return SE3(np.broadcast_to(rotation, (*batch, 3, 3)), np.broadcast_to(translation, (*batch, 3)))
 
 
-def _skew(v: Floats) -> Floats:
-    zero = np.zeros_like(v[..., 0])
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3)
-
-
 def _exponential_coefficients(phi: Floats) -> tuple[Floats, Floats, Floats]:
     """sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 for t = |phi|, without cancellation near zero."""
     angle = np.linalg.norm(phi, axis=-1)
@@ -305,12 +314,12 @@ def _exponential_coefficients(phi: Floats) -> tuple[Floats, Floats, Floats]:
 
 def _left_jacobian(phi: Floats) -> Floats:
     _, second, third = _exponential_coefficients(phi)
-    skew = _skew(phi)
+    skew = cross_matrix(phi)
     return np.eye(3) + second[..., None, None] * skew + third[..., None, None] * (skew @ skew)
 
 
 def _quaternion_to_matrix(q: Floats) -> Floats:
-    skew = _skew(q[..., :3])
+    skew = cross_matrix(q[..., :3])
     return np.eye(3) + 2 * q[..., 3, None, None] * skew + 2 * (skew @ skew)
 
 

@@ -311,7 +311,7 @@ def _best_start(
     wrong."""
     reading = arm_reading(state.T_base_tcp, state.mount)
     pairs = closed_forms(reading, T_cam_board)
-    sampled = ransac(reading, T_cam_board, np.random.default_rng(0))
+    sampled = ransac(reading, T_cam_board)
     if sampled is not None:
         pairs["ransac"] = sampled
     states = {name: replace(state, T_mount_cam=X, T_fixture_board=Z) for name, (X, Z) in pairs.items()}

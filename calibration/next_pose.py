@@ -23,6 +23,8 @@ _LEVER_M = 0.5
 """Distance at which a rotation's error is weighed against a position's (our choice: a camera's distance from
 what it looks at)."""
 
+_CANDIDATES = 300
+_SEED = 0  # of the draw: the same views give the same advice again
 _TILT_RAD = np.radians(40.0)
 _TURN_RAD = np.radians(120.0)
 _SEEN = 0.6  # of the board's corners that a view must show
@@ -51,8 +53,6 @@ def next_pose(
     result: HandEyeResult,
     spec: BoardSpec,
     reachable: Reachable | None = None,
-    candidates: int = 300,
-    seed: int = 0,
 ) -> NextPose:
     """The best of random views of the board, at the distances and about the tilts of a board well seen.
 
@@ -60,14 +60,12 @@ def next_pose(
         result: of the views so far.
         spec: the board.
         reachable: tells of K arm poses which (K,) the arm reaches; all of them by default.
-        candidates: views tried.
-        seed: of the draw.
 
     Raises:
         CalibrationError: no candidate shows enough of the board within the arm's reach.
     """
     state = result.fit.state
-    views = _candidates(result, spec, candidates, np.random.default_rng(seed))
+    views = _candidates(result, spec)
     carried = state.T_mount_cam @ views @ state.T_fixture_board.inverse()  # T_mount_fixture
     T_base_tcp = carried.inverse() if state.mount == "eye_in_hand" else carried
     shown = [_shown(view, result, spec) for view in views]
@@ -76,7 +74,7 @@ def next_pose(
         good &= reachable(T_base_tcp)
     if not good.any():
         raise CalibrationError(
-            f"next pose: none of {candidates} views shows the board within the arm's reach; move the board"
+            f"next pose: none of {_CANDIDATES} views shows the board within the arm's reach; move the board"
             " nearer to the middle of the arm's reach"
         )
     information = result.fit.solution.reduced_normal[TRANSFORMS, TRANSFORMS]
@@ -100,8 +98,9 @@ def next_pose(
     )
 
 
-def _candidates(result: HandEyeResult, spec: BoardSpec, count: int, rng: np.random.Generator) -> SE3:
+def _candidates(result: HandEyeResult, spec: BoardSpec) -> SE3:
     """Random T_cam_board: at about the distances seen so far, tilted, turned, off centre."""
+    rng, count = np.random.default_rng(_SEED), _CANDIDATES
     seen = result.T_base_cam.inverse() @ result.T_base_board_seen
     middle = np.array([0.5 * spec.size_m[0], 0.5 * spec.size_m[1], 0.0])
     depth = seen.apply(middle)[:, 2]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.fusion import turned_alike
 from calibration.object_observability import Tip, describe, openness, turns_that_fit
-from calibration.surface_fit import Surface, coarse_fit, finest_fit
+from calibration.surface_fit import SEED, Surface, coarse_fit, finest_fit
 from calibration.words import axis_name
 from dataset.errors import CalibrationError
 from dataset.transforms import SE3, adjoint
@@ -47,8 +47,6 @@ class ObjectPoseResult:
         distance_m: (n,) signed distances, positive outside.
         unobservable: what the points leave open, in words; empty when the pose is determined.
         rivals: poses elsewhere that fit as well, in words; only a search without a guess finds them.
-        ambiguity_deg: angles by which the object can be turned about the weakest axis without contradicting
-            the points (a discrete or continuous symmetry); empty when there are none.
         runner_up_rms_m: the best fit of a clearly different pose that is no symmetry of the object; close
             to rms_m means the points do not tell them apart.
     """
@@ -60,7 +58,6 @@ class ObjectPoseResult:
     distance_m: Floats
     unobservable: tuple[str, ...]
     rivals: tuple[str, ...]
-    ambiguity_deg: Floats
     runner_up_rms_m: float
 
     def turned_towards(self, reference: SE3, turns: SE3) -> ObjectPoseResult:
@@ -86,7 +83,6 @@ def register_points(
     symmetry_axis: ArrayLike | None = None,
     tip: Tip | None = None,
     symmetry_turns: SE3 | None = None,
-    seed: int = 0,
 ) -> ObjectPoseResult:
     """Fit a mesh to touched points: many starts, point-to-plane ICP (Chen and Medioni 1992), the best
     refined on the exact surface.
@@ -100,7 +96,6 @@ def register_points(
         tip: its ball's radius, and how well it is known; a point known exactly when None.
         symmetry_turns: n rigid motions in the object's frame that leave it looking the same, reported no
             more than that turn.
-        seed: of the starts.
 
     Raises:
         CalibrationError: fewer than 6 points, NaN, points that coincide, a mesh in another unit or mirrored,
@@ -111,15 +106,15 @@ def register_points(
     mesh = trimesh.Trimesh(np.asarray(vertices, np.float64), np.asarray(faces), process=False)
     _require_mesh(mesh)
     _require_size(points, mesh)
-    surface = Surface.of(mesh, tip.ball_m, seed)
-    coarse, coarse_rms = _nearest_fits(points, surface, init, seed)
+    surface = Surface.of(mesh, tip.ball_m)
+    coarse, coarse_rms = _nearest_fits(points, surface, init)
     best = coarse[int(np.argmin(coarse_rms))]
     limit = max(_BAD_FIT_M, _BAD_FIT_SHARE * float(np.linalg.norm(mesh.extents)))
     if coarse_rms.min() > 3 * limit:
-        _require_fit(float(coarse_rms.min()), limit, points, surface, seed)
-    pose, signed, normals = finest_fit(points, surface, best, seed)
+        _require_fit(float(coarse_rms.min()), limit, points, surface)
+    pose, signed, normals = finest_fit(points, surface, best)
     rms = float(np.sqrt(np.mean(signed**2)))
-    _require_fit(rms, limit, points, surface, seed)
+    _require_fit(rms, limit, points, surface)
     freedom = max(len(points) - 6, 1)
     noise = max(float(np.sqrt(np.sum(signed**2) / freedom)), _NOISE_FLOOR_M)
     in_obj = pose.inverse().apply(points)
@@ -138,14 +133,13 @@ def register_points(
         distance_m=signed,
         unobservable=unobservable,
         rivals=(_as_good(pose.inverse() @ rival),) if as_good else (),
-        ambiguity_deg=ambiguity,
         runner_up_rms_m=rival_rms,
     )
 
 
-def _nearest_fits(points: Floats, surface: Surface, init: SE3 | None, seed: int) -> tuple[SE3, Floats]:
+def _nearest_fits(points: Floats, surface: Surface, init: SE3 | None) -> tuple[SE3, Floats]:
     """The most promising of many starts, fitted, and their residuals."""
-    coarse, rms = coarse_fit(points, surface, _starts(points, surface, init, seed), _COARSE_STEPS)
+    coarse, rms = coarse_fit(points, surface, _starts(points, surface, init), _COARSE_STEPS)
     return coarse_fit(points, surface, coarse[np.argsort(rms)[:_PROMISING]], 2 * _COARSE_STEPS)
 
 
@@ -199,12 +193,12 @@ def _require_size(points: Floats, mesh: trimesh.Trimesh) -> None:
         )
 
 
-def _require_fit(rms: float, limit: float, points: Floats, surface: Surface, seed: int) -> None:
+def _require_fit(rms: float, limit: float, points: Floats, surface: Surface) -> None:
     if rms <= min(limit, _DOUBTFUL_FIT_M):
         return
     mesh = surface.mesh
     flipped = trimesh.Trimesh(mesh.vertices * [-1, 1, 1], mesh.faces[:, ::-1], process=False)
-    mirrored = float(_nearest_fits(points, Surface.of(flipped, surface.ball_m, seed), None, seed)[1].min())
+    mirrored = float(_nearest_fits(points, Surface.of(flipped, surface.ball_m), None)[1].min())
     if mirrored < 0.3 * rms:
         raise CalibrationError(
             f"object pose: the points fit the mesh's mirror image ({1000 * mirrored:.1f} mm) and not the mesh"
@@ -218,14 +212,14 @@ def _require_fit(rms: float, limit: float, points: Floats, surface: Surface, see
         )
 
 
-def _starts(points: Floats, surface: Surface, init: SE3 | None, seed: int) -> SE3:
+def _starts(points: Floats, surface: Surface, init: SE3 | None) -> SE3:
     """Poses T_base_obj to start from: around ``init``, or all orientations with the centres brought
     together."""
     if init is not None:
-        twists = np.random.default_rng(seed).normal(size=(_STARTS // 4, 6))
+        twists = np.random.default_rng(SEED).normal(size=(_STARTS // 4, 6))
         twists[0] = 0.0
         return init @ SE3.exp(twists * np.array([0.2 * surface.radius] * 3 + [0.25] * 3))
-    rotation = Rotation.random(_STARTS, rng=np.random.default_rng(seed)).as_matrix()
+    rotation = Rotation.random(_STARTS, rng=np.random.default_rng(SEED)).as_matrix()
     # The touched side is not the whole object, so the mean of the points is not its centre: their box's is
     # closer.
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))

@@ -30,6 +30,7 @@ _MIN_CONDITION = 0.2
 _LIGHT_CELLS = 33
 """Over so many cells the light is taken to be even (our choice)."""
 _PLAUSIBLE_GAIN = (0.5, 1.6)
+_DEGREE = 4  # of the polynomial that the fall of the light over the image resembles (our choice)
 _CROP = 128
 
 
@@ -197,13 +198,13 @@ def _light(level: Image, colours: int) -> Image:
     return np.repeat(np.repeat(light, 2, axis=0), 2, axis=1)
 
 
-def _polynomial(image: Image, degree: int = 4) -> Image:
+def _polynomial(image: Image) -> Image:
     """The polynomial in x and y closest to an image (h, w)."""
     height, width = image.shape
     y, x = np.linspace(-1, 1, height), np.linspace(-1, 1, width)
     step = max(1, min(height, width) // 64)
 
-    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
     coarse = np.stack([np.multiply.outer(y[::step] ** i, x[::step] ** j).ravel() for i, j in powers], axis=1)
     fit, *_ = np.linalg.lstsq(coarse, image[::step, ::step].ravel(), rcond=None)
     level = np.zeros((height, width), np.float32)

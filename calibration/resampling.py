@@ -11,6 +11,7 @@ from calibration.hand_eye import HandEyeResult
 
 DRAWS = 100
 _LEVEL = 95.0
+_SEED = 0  # the same views give the same intervals again
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +32,13 @@ class Intervals:
         return np.degrees(0.5 * (self.high - self.low)[3:])
 
 
-def bootstrap(result: HandEyeResult, draws: int = DRAWS, seed: int = 0) -> Intervals:
+def bootstrap(result: HandEyeResult, draws: int = DRAWS) -> Intervals:
     """Percentile intervals from ``draws`` recordings drawn from the views with replacement.
 
     Unlike the covariance they assume no model of the noise. The spread is widened by sqrt(n / (n - 2)), the
     usual correction of two poses' worth of unknowns in n views (Efron & Tibshirani 1993, sec. 5.3).
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     count = result.observations.view_count
     apart = np.empty((draws, 6))
     for draw in range(draws):

@@ -68,7 +68,6 @@ def solve_robot_world(
     mount: Mount = "eye_in_hand",
     camera_covariance: Floats | None = None,
     scale_known: bool = True,
-    seed: int = 0,
 ) -> RobotWorldResult:
     """Both unknown transforms from N pairs of poses.
 
@@ -79,7 +78,6 @@ def solve_robot_world(
         camera_covariance: (N, 6, 6) of T_cam_board's translation in the camera's frame and rotation vector on
             the right, up to a common factor, where it is known (`pose_covariance`).
         scale_known: False when the camera's translations are in an unknown unit (monocular odometry).
-        seed: of RANSAC's draws.
 
     Raises:
         CalibrationError: sizes that differ, or poses that do not determine the transforms.
@@ -97,7 +95,7 @@ def solve_robot_world(
         )
     spread = require_observable(T_base_tcp, mount)
     reading = arm_reading(T_base_tcp, mount)
-    start = start_from(reading, T_cam_board, scale_known, np.random.default_rng(seed))
+    start = start_from(reading, T_cam_board, scale_known)
     pairs = PosePairs(T_base_tcp, T_cam_board, mount, camera_covariance)
     free = unknown_names("transforms") if scale_known else unknown_names("transforms", "scale")
     return refine(pairs, start, free, spread)
@@ -282,14 +280,13 @@ def _by_right(pose: SE3) -> Floats:
     return matrix
 
 
-def start_from(reading: SE3, T_cam_board: SE3, scale_known: bool, rng: np.random.Generator) -> Unknowns:
+def start_from(reading: SE3, T_cam_board: SE3, scale_known: bool) -> Unknowns:
     """Where to start: of the closed forms and RANSAC, the one most views agree with.
 
     Args:
         reading: T_fixture_mount of N views.
         T_cam_board: N.
         scale_known: False when the camera's translations are in an unknown unit.
-        rng: for RANSAC.
 
     Raises:
         CalibrationError: no method finds a transform.
@@ -298,7 +295,7 @@ def start_from(reading: SE3, T_cam_board: SE3, scale_known: bool, rng: np.random
         return _start_without_scale(reading, T_cam_board)
     few = np.unique(np.linspace(0, len(reading) - 1, _START_VIEWS).astype(int))
     candidates = list(closed_forms(reading[few], T_cam_board[few]).values())
-    sampled = ransac(reading, T_cam_board, rng)
+    sampled = ransac(reading, T_cam_board)
     candidates += [] if sampled is None else [sampled]
     if not candidates:
         raise CalibrationError(

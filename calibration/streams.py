@@ -113,7 +113,6 @@ def solve_streams(
     camera_s: Floats,
     T_cam_board: SE3,
     mount: Mount = "eye_in_hand",
-    seed: int = 0,
 ) -> RobotWorldResult:
     """Both unknown transforms and the clocks' offset from two streams of poses in motion.
 
@@ -123,7 +122,6 @@ def solve_streams(
         camera_s: (N,) times of the pictures on the camera's clock, seconds, increasing.
         T_cam_board: N poses of the board.
         mount: who carries the camera.
-        seed: of RANSAC's draws.
 
     Raises:
         CalibrationError: sizes that differ, NaN, speeds that do not correlate, poses that do not determine
@@ -149,9 +147,7 @@ def solve_streams(
         arm.at(camera_s + offset)[known], T_cam_board[known], mount, trace=arm, camera_s=camera_s[known]
     )
     spread = require_observable(pairs.T_base_tcp, mount)
-    start = start_from(
-        arm_reading(pairs.T_base_tcp, mount), pairs.T_cam_board, True, np.random.default_rng(seed)
-    )
+    start = start_from(arm_reading(pairs.T_base_tcp, mount), pairs.T_cam_board, scale_known=True)
     start = replace(start, offset_s=offset)
     return refine(pairs, start, unknown_names("transforms", "offset"), spread)
 

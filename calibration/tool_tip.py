@@ -29,6 +29,7 @@ _SLIP_FLOOR_M = 3e-4
 _MAX_RMS_M = 2e-3
 _NOISE_FLOOR_M = 2e-5
 _MOST_SLIPPED = 0.4
+_SEED = 0  # of the draws: the same poses give the same tip again
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +63,13 @@ class ToolTipResult:
         return float(np.sqrt(np.trace(self.covariance)))
 
 
-def calibrate_tool_tip(T_base_tcp: SE3, seed: int = 0) -> ToolTipResult:
+def calibrate_tool_tip(T_base_tcp: SE3) -> ToolTipResult:
     """The tip from N poses of the arm about one fixed point.
 
     The poses in which the tip slipped are found by consensus and left out, named by `used`.
 
     Args:
         T_base_tcp: N poses.
-        seed: of the consensus' draws.
 
     Raises:
         CalibrationError: fewer than 6 poses, NaN, a tool that was not tilted enough (the message says about
@@ -78,7 +78,7 @@ def calibrate_tool_tip(T_base_tcp: SE3, seed: int = 0) -> ToolTipResult:
     _check(T_base_tcp)
     rotation, translation = T_base_tcp.rotation, T_base_tcp.translation
     require_swing(rotation)
-    used = _consensus(rotation, translation, seed)
+    used = _consensus(rotation, translation)
     swing, axes = require_swing(rotation[used])
     tip, point, normal = _solve(rotation[used], translation[used])
     distance = np.linalg.norm(rotation @ tip + translation - point, axis=1)
@@ -140,10 +140,10 @@ def _solve(rotation: Floats, translation: Floats) -> tuple[Floats, Floats, Float
     return solution[:3], solution[3:], normal
 
 
-def _consensus(rotation: Floats, translation: Floats, seed: int) -> NDArray[np.bool_]:
+def _consensus(rotation: Floats, translation: Floats) -> NDArray[np.bool_]:
     """The poses that share a point: least median of squares over drawn subsets (Rousseeuw 1984), then all
     within reach of it, twice."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     count = len(rotation)
     best, distance = np.inf, np.zeros(count)
     for _ in range(_SUBSETS):

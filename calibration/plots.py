@@ -35,7 +35,7 @@ def residual_scatter(residual_px: Floats, outlier: NDArray[np.bool_]) -> str:
         parts.append(
             _text(centre + 4, centre - fraction * span * scale + 13, f"{fraction * span:g} px", "start")
         )
-    return _svg(size, size, parts, "residual scatter")
+    return svg(size, size, parts, "residual scatter")
 
 
 def residual_field(
@@ -68,7 +68,7 @@ def residual_field(
         )
         dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="1.3"/>' for a, b in starts)
         parts.append(f'<g fill="{colour}" fill-opacity=".8">{dots}</g>')
-    return _svg(640, height * scale, parts, "residual field"), magnify
+    return svg(640, height * scale, parts, "residual field"), magnify
 
 
 def bars(
@@ -94,7 +94,7 @@ def bars(
             parts.append(_text(middle, 26, f"{value:.2g}", "middle"))
         if i % every == 0:
             parts.append(_text(middle, height - 10, labels[i], "middle"))
-    return _svg(width, height, parts, "bars")
+    return svg(width, height, parts, "bars")
 
 
 def curve(x: Floats, y: Floats, mark_x: float, x_label: str, y_label: str) -> str:
@@ -135,7 +135,7 @@ def _graph(
     parts.append(
         f'<path d="{path}" fill="none" stroke="var(--accent)" stroke-width="2" stroke-linejoin="round"/>'
     )
-    return _svg(width, height, parts, y_label)
+    return svg(width, height, parts, y_label)
 
 
 def overlay(image: NDArray[np.uint8], seen: Floats, predicted: Floats, level: int) -> str:
@@ -157,7 +157,7 @@ def overlay(image: NDArray[np.uint8], seen: Floats, predicted: Floats, level: in
         f"M{x - 4 * unit:.2f} {y:.2f}h{8 * unit:.2f}M{x:.2f} {y - 4 * unit:.2f}v{8 * unit:.2f}"
         for x, y in crosses - corner
     )
-    return _svg(
+    return svg(
         extent[0],
         extent[1],
         [
@@ -198,7 +198,7 @@ def pose_sketch(T_ref_cam: SE3, board_corners: Floats, used: NDArray[np.bool_], 
             f'<g stroke="{colour}" stroke-width="1.2" stroke-linejoin="round"><path d="{edges}" fill="none"/>'
             f'<polygon points="{_points(corners)}" fill="{colour}" fill-opacity=".16"/></g>'
         )
-    return _svg(640, 470, parts, "camera poses")
+    return svg(640, 470, parts, "camera poses")
 
 
 def mesh_sketch(vertices: Floats, faces: NDArray[np.integer], points: Floats, distance_m: Floats) -> str:
@@ -219,7 +219,15 @@ def mesh_sketch(vertices: Floats, faces: NDArray[np.integer], points: Floats, di
     for (x, y), gap in zip(view(points), np.abs(distance_m), strict=True):
         colour = "var(--good)" if gap < 5e-4 else "var(--warn)"
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{colour}" stroke="var(--card)"/>')
-    return _svg(560, 470, parts, "touched points on the mesh")
+    return svg(560, 470, parts, "touched points on the mesh")
+
+
+def svg(width: float, height: float, parts: Sequence[str], label: str) -> str:
+    """A picture of SVG elements, so many units wide and high; ``label`` describes it to a screen reader."""
+    return (
+        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(label)}"'
+        f' xmlns="http://www.w3.org/2000/svg">{"".join(parts)}</svg>'
+    )
 
 
 class _Isometric:
@@ -253,13 +261,6 @@ class _Isometric:
 
     def depth(self, points: Floats) -> Floats:
         return np.asarray(points @ self._rows[2])
-
-
-def _svg(width: float, height: float, parts: Sequence[str], label: str) -> str:
-    return (
-        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(label)}"'
-        f' xmlns="http://www.w3.org/2000/svg">{"".join(parts)}</svg>'
-    )
 
 
 def _line(x0: float, y0: float, x1: float, y1: float, colour: str, width: float = 1.0) -> str:

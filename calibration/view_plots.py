@@ -8,6 +8,8 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.plots import svg
+
 Floats = NDArray[np.float64]
 
 _CELLS = (6, 8)
@@ -35,7 +37,7 @@ def coverage_map(pixels: Floats, image_size: tuple[int, int]) -> str:
             f'<text x="{x + cell_w / 2:.1f}" y="{y + cell_h / 2 + 4:.1f}" text-anchor="middle">{count:.0f}'
             "</text>"
         )
-    return _svg(_WIDTH, cell_h * rows, parts, "corners seen in each part of the image")
+    return svg(_WIDTH, cell_h * rows, parts, "corners seen in each part of the image")
 
 
 def view_residuals(
@@ -74,11 +76,4 @@ def view_residuals(
             f'<text x="2" y="{panel_h + 15:.0f}">{escape(label)}</text></g>'
         )
     rows = -(-count // _PANELS_A_ROW)
-    return _svg(_PANELS_A_ROW * (_PANEL + 10) - 10, rows * (panel_h + 26), parts, "residuals of every view")
-
-
-def _svg(width: float, height: float, parts: list[str], label: str) -> str:
-    return (
-        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(label)}"'
-        f' xmlns="http://www.w3.org/2000/svg">{"".join(parts)}</svg>'
-    )
+    return svg(_PANELS_A_ROW * (_PANEL + 10) - 10, rows * (panel_h + 26), parts, "residuals of every view")

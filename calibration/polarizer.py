@@ -15,11 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.polarizer_states import Progress, States, angle_states, cell_means, orientation_deg
+from calibration.polarizer_states import States, angle_states, cell_means, orientation_deg
 from dataset.errors import CalibrationError
 from dataset.frames import Mosaic
 from dataset.polarimetry import Raw, superpixel, white_level
 from dataset.polarizer_response import POLARIZER_CELL, PolarizerResponse
+from dataset.progress import Progress, silent
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -64,7 +65,7 @@ def calibrate_polarizer(
     bits: int,
     angles: ArrayLike | None = None,
     extinction_ratio: float = np.inf,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> PolarizerResult:
     """The response of every pixel from frames of an even, unpolarized light behind a turned polarizer.
 
@@ -90,7 +91,7 @@ def fit_response(
     layout: Mosaic,
     bits: int,
     extinction_ratio: float = np.inf,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> PolarizerResult:
     """The response of every pixel from K frames of known states of light, however they were made.
 
@@ -155,7 +156,7 @@ def _require_determined(frames: int, stokes: Floats) -> None:
 
 
 def _accumulate(
-    frames: Sequence[Raw], weights: Image, on_progress: Progress | None
+    frames: Sequence[Raw], weights: Image, on_progress: Progress
 ) -> tuple[Image, NDArray[np.float64]]:
     """Sum of weights (3, K) times frames: (H, W, 3); and a crop of every frame (K, c, c), for its noise."""
     total: Image | None = None
@@ -167,8 +168,7 @@ def _accumulate(
         for component in range(3):
             total[component] += weights[component, index] * raw
         crops.append(raw[:_CROP, :_CROP].astype(np.float64))
-        if on_progress is not None:
-            on_progress(len(frames) + index + 1, 2 * len(frames))
+        on_progress(len(frames) + index + 1, 2 * len(frames))
     assert total is not None
     return np.moveaxis(total, 0, -1), np.stack(crops)
 

@@ -6,7 +6,7 @@ of: angles, levels and the four mean analysis vectors together, each held to wha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +16,9 @@ from scipy.optimize import least_squares
 from dataset.errors import CalibrationError
 from dataset.polarimetry import SATURATED, Raw
 from dataset.polarizer_response import POLARIZER_CELL
+from dataset.progress import Progress, silent
 
 Floats = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
 # Our choices: what a mean over a million pixels, a lamp, a dial and a sensor are good to.
@@ -76,7 +76,7 @@ class States:
 
 
 def cell_means(
-    frames: Sequence[Raw], block: int, white: int, fewest: int, on_progress: Progress | None = None
+    frames: Sequence[Raw], block: int, white: int, fewest: int, on_progress: Progress = silent
 ) -> Floats:
     """(K, 4) mean reading of the four kinds of pixels in every frame, row by row of the cell, white = 1.
 
@@ -103,8 +103,7 @@ def cell_means(
                 " at 80 % of the white level"
             )
         means[index] = [raw[row::2, column::2].mean() / white for row in range(2) for column in range(2)]
-        if on_progress is not None:
-            on_progress(index + 1, 2 * len(frames))
+        on_progress(index + 1, 2 * len(frames))
     dark = np.flatnonzero(means.mean(axis=1) < _DARK)
     if len(dark):
         raise CalibrationError(

@@ -10,12 +10,12 @@ import numpy as np
 
 from calibration.polarizer import PolarizerResult, calibrate_polarizer
 from calibration.polarizer_report import polarizer_section
-from calibration.polarizer_states import Progress
 from calibration.records import PolarizerRecord, Source
 from calibration.response_file import write_response
 from calibration.result import Calibration
 from calibration.steps import write_report
 from dataset.polarimetry import Raw
+from dataset.progress import Progress, silent
 from dataset.session import Session
 
 
@@ -23,7 +23,7 @@ def add_polarizer(
     session: Path,
     calibration: Path,
     extinction_ratio: float = np.inf,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> PolarizerRecord:
     """Estimates the response of every pixel from a session of kind "polarizer".
 
@@ -51,7 +51,7 @@ def add_polarizer(
 
 
 def polarizer_from_session(
-    session: Session, extinction_ratio: float = np.inf, on_progress: Progress | None = None
+    session: Session, extinction_ratio: float = np.inf, on_progress: Progress = silent
 ) -> PolarizerResult:
     """The response from a session's frames, at the dial's angles where they were recorded.
 

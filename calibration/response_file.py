@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calibration.records import PolarizerRecord
 from dataset.errors import CalibrationError
 from dataset.polarizer_response import PolarizerResponse
+from dataset.whole_files import replacing
 
 
 def write_response(calibration: Path, response: PolarizerResponse) -> tuple[Path, str]:
@@ -22,10 +23,9 @@ def write_response(calibration: Path, response: PolarizerResponse) -> tuple[Path
         CalibrationError: the file cannot be written.
     """
     path = calibration.with_name(f"{calibration.stem}-polarizer.npz")
-    temporary = path.with_name(f"{path.stem}.part.npz")
     try:
-        np.savez(temporary, analysis=response.analysis)
-        temporary.replace(path)
+        with replacing(path) as partial, partial.open("wb") as stream:
+            np.savez(stream, analysis=response.analysis)
     except OSError as error:
         raise CalibrationError(
             f"{path}: cannot be written ({error.strerror}); check the folder exists, is writable and has room"

@@ -31,6 +31,7 @@ from dataset.errors import CalibrationError
 from dataset.frames import CameraInfo
 from dataset.polarizer_response import PolarizerResponse
 from dataset.transforms import SE3
+from dataset.whole_files import replacing
 
 Floats = NDArray[np.float64]
 
@@ -114,20 +115,19 @@ class Calibration:
         return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
     def save(self, path: str | Path) -> None:
-        """Writes calibration.json, through a temporary file: a reader never sees half of it. The polarizers'
-        file, where there is one, comes along.
+        """Writes calibration.json; a reader never sees half of it. The polarizers' file, where there is
+        one, comes along.
 
         Raises:
             CalibrationError: the file cannot be written.
         """
         path = Path(path)
-        temporary = path.with_name(path.name + ".tmp")
         try:
             folder = None if self.polarizer is None else self.polarizer.folder
             if self.polarizer is not None and folder is not None and folder != path.parent:
                 shutil.copyfile(folder / self.polarizer.file, path.parent / self.polarizer.file)
-            temporary.write_text(self.to_json(), encoding="utf-8")
-            temporary.replace(path)
+            with replacing(path) as partial:
+                partial.write_text(self.to_json(), encoding="utf-8")
         except OSError as error:
             raise CalibrationError(
                 f"{path}: cannot be written ({error.strerror}); check the folder exists and is writable"

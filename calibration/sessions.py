@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,12 +17,12 @@ from calibration.result import Calibration
 from calibration.streams import ArmTrace
 from calibration.time_offset import TimeOffsetResult, estimate_time_offset
 from dataset.errors import CalibrationError
+from dataset.progress import Progress, silent
 from dataset.session import Session
 from dataset.transforms import SE3
 
 Floats = NDArray[np.float64]
 Detections = list[tuple[int, Detection]]
-Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
 _REST_WINDOW_S = 0.1
@@ -35,7 +34,7 @@ _LONGEST_HOLE_S, _LONGEST_HOLE_PERIODS = 0.04, 3.0
 """Our choice: at 0.5 m/s^2 a straight line over 40 ms is off by 0.1 mm."""
 
 
-def detect_session(session: Session, spec: BoardSpec, on_progress: Progress | None = None) -> Detections:
+def detect_session(session: Session, spec: BoardSpec, on_progress: Progress = silent) -> Detections:
     """The board in every frame that shows it: (frame index, corners in mosaic pixels).
 
     Raises:
@@ -46,8 +45,7 @@ def detect_session(session: Session, spec: BoardSpec, on_progress: Progress | No
         detection = detect_in_mosaic(session.mosaic(index), session.camera.mosaic, spec)
         if detection is not None:
             found.append((index, detection))
-        if on_progress is not None:
-            on_progress(index + 1, len(session))
+        on_progress(index + 1, len(session))
     if not found:
         raise CalibrationError(f"{session.path}: no frame shows the board; {_why_no_board(session, spec)}")
     return found

@@ -29,7 +29,6 @@ from calibration.resampling import Intervals, bootstrap
 from calibration.result import Calibration
 from calibration.sessions import (
     Detections,
-    Progress,
     detect_session,
     hand_eye_from_session,
     intrinsics_from_session,
@@ -38,6 +37,7 @@ from calibration.sessions import (
 )
 from calibration.view_selection import select_views
 from dataset.errors import CalibrationError
+from dataset.progress import Progress, silent
 from dataset.session import Session
 
 _PICTURES = 3
@@ -46,7 +46,7 @@ _NO_PRIOR = 1e6
 
 
 def add_intrinsics(
-    session: Path, spec: BoardSpec, calibration: Path, on_progress: Progress | None = None
+    session: Path, spec: BoardSpec, calibration: Path, on_progress: Progress = silent
 ) -> IntrinsicsRecord:
     """Estimates K and distortion from stills of the board. What was estimated with other intrinsics goes:
     hand-eye, the fixed camera's place and the time offset, and another camera's polarizers; tool tip and
@@ -89,7 +89,7 @@ def add_hand_eye(
     session: Path,
     spec: BoardSpec,
     calibration: Path,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
     mount: Mount = "eye_in_hand",
     refine_camera: bool = False,
     reachable: Reachable | None = None,
@@ -165,7 +165,7 @@ def _advice(result: HandEyeResult, spec: BoardSpec, reachable: Reachable | None)
 
 
 def add_time_offset(
-    session: Path, spec: BoardSpec, calibration: Path, on_progress: Progress | None = None
+    session: Path, spec: BoardSpec, calibration: Path, on_progress: Progress = silent
 ) -> TimeOffsetRecord:
     """Estimates the delay between the camera's and the arm's time from the board filmed in motion.
 

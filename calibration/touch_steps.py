@@ -18,10 +18,9 @@ from calibration.steps import write_report
 from calibration.touch_report import TouchedObject, object_section, tool_tip_section
 from calibration.touches import KnownTip, Touches, read_points, tool_tip_from_session, touched_points
 from dataset.errors import CalibrationError
+from dataset.schema import SUFFIXES
 from dataset.session import Session
 from dataset.transforms import SE3
-
-_SESSIONS = (".h5", ".hdf5")
 
 
 def add_tool_tip(session: Path, calibration: Path) -> ToolTipRecord:
@@ -108,7 +107,7 @@ def add_object(
 
 
 def _read(path: Path, calibration: Path, tip: KnownTip | None) -> Touches:
-    if path.suffix not in _SESSIONS:
+    if path.suffix not in SUFFIXES:
         return Touches(read_points(path), Tip(0.0 if tip is None else tip.ball_m))
     with Session.open(path) as opened:
         return touched_points(opened, known_tip(calibration, None) if tip is None else tip)

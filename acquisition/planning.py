@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from acquisition.clearance import CarriedCamera, is_clear, sweep_clear
-from acquisition.kinematics import JOINT_LIMIT, inverse_all, unwrap_near
+from acquisition.kinematics import JOINT_LIMIT, forward, inverse_all, unwrap_near
 from dataset.errors import ToolkitError
 from dataset.transforms import SE3
 
@@ -94,6 +94,7 @@ def plan_stills(
     start = np.asarray(q_start, dtype=np.float64)
     q, index = _nearest_next(candidates, reachable, start, camera)
     order = shorten(start, q, camera)
+    _require_some(q, len(T_base_cam), start, camera)
     return _plan([q[i] for i in order], [index[i] for i in order], len(T_base_cam))
 
 
@@ -180,6 +181,7 @@ def plan_path(
         for bend in range(candidates.shape[2])
     ]
     best = max(plans, key=lambda plan: sum(view != VIA for view in plan[1]))
+    _require_some(best[0], len(T_base_cam), start, camera)
     return _plan(*best, len(T_base_cam))
 
 
@@ -238,12 +240,25 @@ def _wind(q: Floats, start: Floats) -> Floats:
     return np.asarray(q + turns[best])
 
 
-def _plan(q: list[Floats], index: list[int], wished: int) -> JointPlan:
-    if not q:
+def _require_some(q: list[Floats], wished: int, start: Floats, camera: CarriedCamera) -> None:
+    """Raises ToolkitError where no view is reached: why that may be."""
+    if q:
+        return
+    if not is_clear(start, camera):
+        x, y, z = (forward(start) @ camera.T_flange_tcp).translation
+        low, high = camera.workspace
         raise ToolkitError(
-            f"the arm reaches none of {wished} views; check T_tcp_cam_guess, the workspace and where the "
-            "board or object is in the rig file, or move it to 0.35-0.6 m from the arm's base"
+            f"no way leads on from where the arm stands, its tool at ({x:.3f}, {y:.3f}, {z:.3f}) m: outside "
+            f"the workspace {low} to {high}, or too near to the table or itself; move it inside at the "
+            "pendant, bent, above the table"
         )
+    raise ToolkitError(
+        f"the arm reaches none of {wished} views; check T_tcp_cam_guess, the workspace and where the "
+        "board or object is in the rig file, or move it to 0.35-0.6 m from the arm's base"
+    )
+
+
+def _plan(q: list[Floats], index: list[int], wished: int) -> JointPlan:
     missing = np.setdiff1d(np.arange(wished), index)
     return JointPlan(np.array(q), np.array(index, dtype=np.intp), missing)
 

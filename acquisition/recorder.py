@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from acquisition.camera import Camera
+from acquisition.camera import Camera, CameraLost
 from acquisition.frame_stream import FrameLedger
 from acquisition.live import OnProgress, Progress, Recorder, RecorderStatus, ignore, recording
 from acquisition.robot import PoseSource, Robot
@@ -193,9 +193,12 @@ def record_touches(
 def _triggered_frame(camera: Camera, ledger: FrameLedger) -> RawFrame:
     """A frame whose exposure begins now. At most one trigger is outstanding; the second must succeed."""
     camera.trigger()
-    with contextlib.suppress(DeviceError):
+    try:
         return camera.read()
-    camera.trigger()
+    except CameraLost:
+        raise
+    except DeviceError:
+        camera.trigger()
     try:
         return camera.read()
     except DeviceError as error:

@@ -20,8 +20,9 @@ from dataset.transforms import SE3, interpolate_poses
 
 Floats = NDArray[np.float64]
 
-RANGE_S = 0.6
-"""Offsets searched, either way (our choice: a trigger, a network and a buffer stay well below)."""
+RANGE_S = 1.7
+"""Offsets searched, either way (our choice: a trigger, a network and a buffer stay well below; a simulated
+camera on a slow machine takes up to 1.5 s for a picture)."""
 
 _STEP_S = 0.01
 _TURN_S = 0.1  # a shorter interval turns the poses' noise into speed

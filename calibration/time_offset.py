@@ -87,13 +87,18 @@ def estimate_time_offset(
 
     Raises:
         CalibrationError: too few frames inside the trace, too little motion to tell, or no offset within
-            +-0.6 s.
+            +-1.7 s.
     """
     problem = _Problem.prepare(
         host_mid_ns, trace_ns, trace, detections, spec, intrinsics, T_tcp_cam, T_base_board
     )
     scan = np.arange(-RANGE_S, RANGE_S + 0.5 * _SCAN_STEP_S, _SCAN_STEP_S)
     errors = np.array([problem.median_error(dt) for dt in scan])
+    if not np.isfinite(errors).any():
+        raise CalibrationError(
+            "time offset: most frames lie outside the arm's trace; record the trace from before the first to"
+            " after the last frame"
+        )
     offset = float(scan[np.argmin(errors)])
     correlation = _correlate(problem, detections, spec)
     if correlation is not None and problem.median_error(correlation.best_s) < errors.min():

@@ -24,6 +24,7 @@ Times = NDArray[np.int64]
 _WINDOW_S = 1.0
 _FEWEST_WINDOWS, _ENOUGH_WINDOWS, _MOST_WINDOWS = 8, 24, 400  # shorter for a short capture, longer for hours
 _SAMPLES_PER_WINDOW = 4  # and longer ones for single pictures, of which each can be late
+_PAUSE_STEPS = 10
 _PIECE_S = 300.0  # our choice: a rate that changes by 1 ppm in ten minutes bends by 20 us within a piece
 _WINDOWS_PER_PIECE = 20
 _CRYSTAL_PPM = 50.0  # our choice: how far a device's rate is expected from the host's before the data speak
@@ -173,7 +174,7 @@ def _fit_run(device: Times, host: Times) -> tuple[list[int], list[ClockFit]]:
     elapsed = (device - device[0]) * 1e-9
     pieces = max(1, round(elapsed[-1] / _PIECE_S))
     times, earliest = _window_minima(elapsed, lateness, max(_MOST_WINDOWS, pieces * _WINDOWS_PER_PIECE))
-    knots = np.linspace(0.0, elapsed[-1], pieces + 1)
+    knots = _knots(times, float(elapsed[-1]), pieces)
     values = _lower_chain(times, earliest, knots)
     slopes = np.diff(values) / np.diff(knots)
     if np.abs(slopes).max() > _LARGEST_RATE_ERROR * 1e9:
@@ -191,6 +192,18 @@ def _fit_run(device: Times, host: Times) -> tuple[list[int], list[ClockFit]]:
     return first, fits
 
 
+def _knots(times_s: Floats, span_s: float, pieces: int) -> Floats:
+    """Where pieces meet: at equal distances, but for those between which too little arrived to place a line,
+    as in a pause."""
+    knots, begun = [0.0], 0
+    for knot in np.linspace(0.0, span_s, pieces + 1)[1:-1]:
+        ended = int(np.searchsorted(times_s, knot))
+        if min(ended - begun, len(times_s) - ended) >= _WITNESS:
+            knots.append(float(knot))
+            begun = ended
+    return np.array([*knots, span_s])
+
+
 def _other_unit(ratio: float) -> ToolkitError:
     return ToolkitError(
         f"fit_clock: {ratio:.4g} s pass on the host's clock in a second of the device's; its times are not "
@@ -200,13 +213,23 @@ def _other_unit(ratio: float) -> ToolkitError:
 
 def _window_minima(elapsed_s: Floats, lateness_ns: Floats, most: int) -> tuple[Floats, Floats]:
     """The least late sample of every window: its time and its lateness."""
-    span = float(elapsed_s[-1])
+    busy_s = _without_pauses(elapsed_s)
+    span = float(busy_s[-1])
     wanted = min(max(span / _WINDOW_S, _ENOUGH_WINDOWS), len(elapsed_s) / _SAMPLES_PER_WINDOW)
     count = int(np.clip(wanted, _FEWEST_WINDOWS, most))
-    window = np.minimum((elapsed_s * (count / span)).astype(np.int64), count - 1)
+    window = np.minimum((busy_s * (count / span)).astype(np.int64), count - 1)
     order = np.lexsort((lateness_ns, window))
     chosen = order[np.flatnonzero(np.diff(window[order], prepend=-1))]
     return elapsed_s[chosen], lateness_ns[chosen]
+
+
+def _without_pauses(elapsed_s: Floats) -> Floats:
+    """Times on which a pause is no longer than ten samples usually are apart, or a window."""
+    steps = np.diff(elapsed_s)
+    longest = max(_WINDOW_S, _PAUSE_STEPS * float(np.median(steps)))
+    if steps.max() <= longest:
+        return elapsed_s
+    return np.concatenate([elapsed_s[:1], elapsed_s[0] + np.cumsum(np.minimum(steps, longest))])
 
 
 def _lower_chain(times_s: Floats, values_ns: Floats, knots_s: Floats) -> Floats:

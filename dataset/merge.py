@@ -151,14 +151,14 @@ def _placed(sessions: list[Session], files: list[h5py.File]) -> list[_Part]:
     parts = []
     frames = samples = next_id = 0
     for session, file in zip(sessions, files, strict=True):
-        known = np.concatenate(
-            [
-                session.frame_ids,
-                session.drops["frame_id"],
-                session.pauses["first_id"],
-                session.pauses["last_id"],
-            ]
+        named = (
+            session.frame_ids,
+            session.drops["frame_id"],
+            session.pauses["first_id"],
+            session.pauses["last_id"],
         )
+        known = np.concatenate(named)
+        known = known[known >= 0]  # a frame that never came has no id
         shift = next_id - int(known.min()) if len(known) else 0
         parts.append(_Part(session, file, frames, samples, shift))
         next_id = int(known.max()) + shift + 1 if len(known) else next_id
@@ -256,7 +256,7 @@ def _write_tables(target: h5py.File, parts: list[_Part], forget_clocks: bool) ->
     drops, pauses, segments = [], [], []
     for part in parts:
         ledger, gaps = part.session.drops.copy(), part.session.pauses.copy()
-        ledger["frame_id"] += part.id_shift
+        ledger["frame_id"][ledger["frame_id"] >= 0] += part.id_shift
         for name in ("first_id", "last_id"):
             gaps[name] += part.id_shift
         begun = part.session.segments

@@ -17,7 +17,7 @@ from dataset.session.files import check_new, create_whole, open_for_reading
 from dataset.session.seals import leave_open
 from dataset.validate.salvage import copy_content
 
-_SLICE = re.compile(r"(-?\d*):(-?\d*)(?::(\d+))?")
+_SLICE = re.compile(r"((?:-?\d+)?):((?:-?\d+)?)(?::(\d+))?")
 
 
 def subset(path: str | Path, out: str | Path, indices: ArrayLike) -> int:

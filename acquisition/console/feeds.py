@@ -64,6 +64,9 @@ class Feed(ABC):
             except ToolkitError as error:
                 self.problem = str(error)
                 self._closing.wait(_RETRY_S)
+            except Exception as error:  # a fault of ours: the page says so and goes on serving the device
+                self.problem = f"{self._thread.name}: {type(error).__name__}: {error}"
+                self._closing.wait(_RETRY_S)
 
     @abstractmethod
     def _interrupt(self) -> None:

@@ -19,6 +19,7 @@ from dataset.transforms import SE3
 Floats = NDArray[np.float64]
 
 _STEP_RAD = 0.05  # between the points of a joint motion at which the tool is looked at
+_NEARER_BY_M = 1e-4  # from one point to the next, an arm on its way into the workspace may lead away from it
 _SLOWEST = 1e-3  # rad/s; the controller refuses a speed of zero
 
 
@@ -52,16 +53,20 @@ class MotionLimits:
     def check_joint_path(self, q_start: Floats, waypoints: Floats) -> None:
         """Checks the tool along straight lines in joint space, from `q_start` (6,) through (M, 6).
 
-        An arm that stands outside the workspace may move into it. Raises ToolkitError.
+        An arm that stands outside the workspace may move into it, on a way that never leads away from it.
+        Raises ToolkitError.
         """
-        ways = self._ways(q_start, waypoints)
-        if not self._inside(ways[0][:1]).all():
-            ways[0] = ways[0][-1:]
-        self.check_positions(np.vstack(ways))
+        positions = np.vstack(self._ways(q_start, waypoints))
+        beyond = self._beyond(positions)
+        entered = int(np.argmax(beyond <= 0)) if (beyond <= 0).any() else len(beyond)
+        away = np.flatnonzero(np.diff(beyond[:entered]) > _NEARER_BY_M)
+        if len(away):
+            entered = int(away[0]) + 1
+        self.check_positions(positions[entered:] if entered < len(positions) else positions[-1:])
 
     def check_positions(self, positions: Floats) -> None:
         """Raises ToolkitError where the tool's positions (N, 3) leave the workspace."""
-        outside = ~self._inside(positions)
+        outside = self._beyond(positions) > 0
         if outside.any():
             x, y, z = positions[np.argmax(outside)]
             low, high = self._config.workspace
@@ -97,6 +102,7 @@ class MotionLimits:
             ways.append((forward(q) @ self._T_flange_tcp).translation)
         return ways
 
-    def _inside(self, positions: Floats) -> NDArray[np.bool_]:
+    def _beyond(self, positions: Floats) -> Floats:
+        """(N,) metres from positions (N, 3) to the workspace; 0 inside."""
         low, high = (np.array(corner) for corner in self._config.workspace)
-        return np.asarray(((positions >= low) & (positions <= high)).all(axis=1))
+        return np.asarray(np.linalg.norm(np.clip(positions, low, high) - positions, axis=1))

@@ -50,6 +50,7 @@ class UrRobot(UrReceiver, Robot):
         self.config = config
         self._stop_requested = threading.Event()
         self._moving = threading.Lock()
+        self._settled = False
         self._stream = RtdeStream(config.host, config.frequency_hz, config.silence_s)
         self._motion = MotionClient(config.host, self._stream.check, self._settle_tool)
         try:
@@ -181,7 +182,10 @@ class UrRobot(UrReceiver, Robot):
                 f"the arm {self.config.host} does not accept the tool offset {wanted}; check tcp_offset in "
                 "the rig file"
             )
-        self._tcp_offset = self._active_tool(motion)
+        active = self._active_tool(motion)
+        if self._settled and wanted is None:
+            check_unchanged(active, self._tcp_offset, self.config.host)
+        self._tcp_offset, self._settled = active, True
         self._limits = MotionLimits(self.config, self._tcp_offset)
         deadline = time.monotonic() + _TCP_SHOWS_WITHIN_S
         while True:

@@ -118,6 +118,19 @@ def import_(
             if value is None:
                 raise ToolkitError(f"importing {layout} needs --{name.replace('_', '-')}; see --help")
 
+    def refuse(**options: object) -> None:
+        for name, value in options.items():
+            if value is not None:
+                raise ToolkitError(f"importing {layout} takes no --{name.replace('_', '-')}; leave it out")
+
+    of_folders = {"mosaic": mosaic, "bits": bits, "stamps": stamps}
+    of_scenes = {"mesh_units": mesh_units, "pose_units": pose_units}
+    if layout != "raw-folder":
+        refuse(**of_folders)
+    if layout in ("bop", "raw-folder"):
+        refuse(**of_scenes)
+    if layout != "ppp-net":
+        refuse(mesh=mesh)
     if layout == "bop":
         count = import_bop(folder, out)
     elif layout == "raw-folder":

@@ -127,6 +127,18 @@ class TestLimits:
         with pytest.raises(ToolkitError, match="outside the workspace"):
             limits.check_joint_path(high, low[None])
 
+    def test_the_way_into_the_workspace_leads_nowhere_else(self) -> None:
+        limits = MotionLimits(RobotConfig("127.0.0.1", workspace=((-1, -1, 0.3), (1, 1, 0.9))), np.zeros(6))
+        upright, bent = np.array([3.14, -1.57, 0, -1.57, 0, 0]), HOME
+        assert forward(upright).translation[2] > 0.9
+        limits.check_joint_path(upright, bent[None])
+        below = home_plus(0, 1.2, 0, 0, 0, 0)
+        with pytest.raises(ToolkitError, match="outside the workspace"):
+            limits.check_joint_path(upright, np.array([below, bent]))  # in, out at the bottom, and in again
+        deep = home_plus(0, 0.6, 0, 0, 0, 0)
+        with pytest.raises(ToolkitError, match="outside the workspace"):
+            limits.check_joint_path(deep, np.array([below, bent]))  # down first
+
 
 @pytest.mark.devices
 class TestTrace:

@@ -244,3 +244,14 @@ def test_nothing_reachable_says_what_to_check() -> None:
         plan_stills(hemisphere_views([3, 0, 0], (0.3, 0.3), (30, 60), 10), CAMERA, HOME)
     with pytest.raises(ToolkitError, match="reaches none"):
         plan_path(hemisphere_views([3, 0, 0], (0.3, 0.3), (30, 60), 10), CAMERA, HOME)
+
+
+def test_an_arm_that_stands_outside_is_told_to_be_moved() -> None:
+    boxed = replace(CAMERA, workspace=((-0.8, -0.8, 0.05), (0.8, 0.8, 0.9)))
+    upright = np.deg2rad([180, -90, 0, -90, 0, 0])
+    views = hemisphere_views(OBJECT, (0.3, 0.5), (25, 80), 20)
+    for plan in (plan_stills, plan_path):
+        with pytest.raises(
+            ToolkitError, match=r"where the arm stands, .* outside the workspace .* at the pendant"
+        ):
+            plan(views, boxed, upright)

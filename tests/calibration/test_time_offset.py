@@ -63,7 +63,7 @@ def test_an_arm_at_rest_tells_nothing(world):
 
 def test_a_delay_out_of_range_is_refused(world):
     with pytest.raises(CalibrationError, match="no offset within"):
-        _estimate(world, _swing(world, 4, 1.1))
+        _estimate(world, _swing(world, 4, 2.0))
 
 
 def test_too_few_frames_are_refused(world):

@@ -216,3 +216,16 @@ def test_a_moment_recorded_by_a_host_that_stood_still_has_a_clock_in_doubt(stall
     assert fit.b == 1.0
     assert np.abs(fit.to_host(device) - host).max() <= fit.sigma_ns
     assert fit.sigma_ns == pytest.approx(stall_s * 1e9)
+
+
+@pytest.mark.parametrize("pause_s", [260.0, 300.0, 900.0, 3600.0])
+@pytest.mark.parametrize("filmed_s", [10.0, 250.0])
+def test_a_pause_in_which_nothing_arrives_is_bridged(filmed_s: float, pause_s: float) -> None:
+    device, host, true = capture(2 * filmed_s + pause_s, 5, 12, 0.5e-3)
+    elapsed = (device - device[0]) * 1e-9
+    filmed = (elapsed < filmed_s) | (elapsed > filmed_s + pause_s)
+    clock = fit_clock(device[filmed], host[filmed])
+    worst_ms, in_sigmas = errors(clock, device[filmed], true[filmed])
+    assert worst_ms < 1.0
+    assert in_sigmas < 4.0
+    assert list(clock.first) == sorted(set(clock.first))

@@ -18,6 +18,7 @@ from dataset import CameraInfo, ClockFit, Intrinsics, RawFrame, RobotTrace, Sess
 from dataset.merge import merge
 from dataset.session import ObjectRecord, Session, SessionWriter, write_calibration, write_object
 from dataset.session.edit import write_depth
+from dataset.session.seals import leave_open, seal
 from dataset.subset import chosen_frames, subset
 from dataset.validate import validate
 
@@ -262,3 +263,23 @@ except SessionError as error:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "part.h5 cannot be written" in done.stdout, done
     assert sorted(path.name for path in tmp_path.iterdir()) == ["session.h5"]
+
+
+def test_a_frame_that_never_came_keeps_having_no_id(make_part: Callable[..., Path], tmp_path: Path) -> None:
+    one, other = make_part("one.h5", 0), make_part("other.h5", 9)
+    with h5py.File(other, "r+") as file:
+        drops = file["camera/drops"]
+        drops.resize(2, axis=0)
+        drops[1] = (-1, b"triggered twice, never came", 10**10)
+        leave_open(drops)
+        seal(file)
+    merge([one, other], tmp_path / "both.h5")
+    assert validate(tmp_path / "both.h5") == []
+    with Session.open(tmp_path / "both.h5") as session:
+        assert sorted(session.drops["frame_id"])[0] == -1
+
+
+@pytest.mark.parametrize("frames", ["5:-", "-:", "-:-:2", "a:b"])
+def test_half_a_number_is_no_slice(recorded: Path, frames: str) -> None:
+    with Session.open(recorded) as session, pytest.raises(SessionError, match="give a slice such as"):
+        chosen_frames(session, frames, None)

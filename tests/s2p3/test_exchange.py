@@ -62,6 +62,23 @@ def test_an_import_asks_for_what_it_cannot_know(
     assert f"needs {option}" in line
 
 
+@pytest.mark.parametrize(
+    ("layout", "words", "option"),
+    [
+        ("raw-folder", ["--mosaic", "mono", "--mesh-units", "mm"], "--mesh-units"),
+        ("bop", ["--pose-units", "m"], "--pose-units"),
+        ("housecat6d", ["--mesh-units", "m", "--pose-units", "m", "--mesh", "cup.ply"], "--mesh"),
+        ("ppp-net", ["--bits", "12"], "--bits"),
+    ],
+)
+def test_an_option_of_another_layout_is_refused(
+    layout: str, words: list[str], option: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "s.h5"
+    assert main(["dataset", "import", layout, str(tmp_path), *words, "--out", str(out)]) == 2
+    assert f"importing {layout} takes no {option}" in capfd.readouterr().err
+
+
 def test_a_folder_of_mosaics_comes_in(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.full((8, 8), 9, np.uint8))
     out = tmp_path / "s.h5"

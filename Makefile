@@ -9,7 +9,7 @@ OUT    ?= out/demo
 
 .PHONY: demo quick test lint docs clean
 
-demo: $(VENV)/.ready           ## the main job on the simulated lab, about 23 minutes on two cores
+demo: $(VENV)/.ready           ## the main job on the simulated lab, about half an hour on two cores
 	$(BIN)/s2p3 demo --out $(OUT)
 
 quick: $(VENV)/.ready          ## the same in under five minutes; it shows the way, not the accuracy

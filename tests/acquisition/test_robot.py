@@ -252,6 +252,17 @@ class TestToolAndPayload:
         arm.command(f"tcp {' '.join(map(str, TCP))}")
         robot.move_joints(HOME)
 
+    def test_a_tool_changed_while_no_program_ran_stops_the_next_move(self, arm: SimulatedRobot) -> None:
+        with UrRobot(config(arm, tcp_offset=None)) as robot:  # the tool is whatever is active
+            before = robot.tcp_offset
+            arm.command("local")  # which ends the program
+            arm.command("tcp 0 0 0.2 0 0.3 0")
+            arm.command("remote")
+            with pytest.raises(DeviceError, match=r"was changed from .* connect again, and calibrate"):
+                robot.move_joints(HOME + 0.1)
+            np.testing.assert_array_equal(robot.tcp_offset, before)
+        arm.command(f"tcp {' '.join(map(str, TCP))}")
+
     def test_software_that_tells_neither_tool_nor_payload(self) -> None:
         with SimulatedRobot("127.0.0.24", software=(5, 4, 0)) as old:
             with pytest.raises(ToolkitError, match="tcp_offset is missing, and this controller's software"):

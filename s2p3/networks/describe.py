@@ -33,7 +33,7 @@ def describe(kind: Literal["teacher", "student"], config: ExperimentConfig) -> d
     """
     large = dataclasses.replace(
         config,
-        input=dataclasses.replace(config.input, size=_SIZE),
+        input=dataclasses.replace(config.input, size=_SIZE, canonical_size=2 * _SIZE),
         network=dataclasses.replace(config.network, total_stride=_STRIDE),
     )
     build = _BUILDERS[kind]

@@ -38,5 +38,5 @@ def test_a_live_camera_gives_as_many_shots_as_asked_for(simulated_camera: Simula
     stands = FixedCameraRecord(still, still, np.eye(12), 0.1, 0.1, 0.01, 1e-5, 1e-5, 20, ())
     (shot,) = live_shots(rig, replace(calibration(192, 256), fixed_camera=stands), 1)  # there is no arm
     assert shot.T_base_cam is still
-    with pytest.raises(ToolkitError, match="the calibration is of 512x384; calibrate this camera"):
+    with pytest.raises(ToolkitError, match="of 256x192 pixels, the intrinsics are for 512x384"):
         next(live_shots(rig, calibration(384, 512), 1))

@@ -13,10 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from acquisition.camera import Camera, CameraLost
 from acquisition.rig import Rig, open_camera, open_pose_source
 from calibration import Calibration
 from dataset import SE3, CameraInfo, Intrinsics
-from dataset.frames import SUPERPIXEL, Mosaic
+from dataset.errors import DeviceError
+from dataset.frames import SUPERPIXEL, Mosaic, RawFrame
 from dataset.importers.raw_folder import RawMosaics
 from dataset.on_camera import decode_frame
 from dataset.polarimetry import Raw, remap
@@ -89,10 +91,21 @@ def live_shots(rig: Rig, calibration: Calibration, count: int | None) -> Iterato
         camera.start("software")
         taken = 0
         while count is None or taken < count:
-            camera.trigger()
-            frame = camera.read()
+            frame = _triggered(camera)
             yield decoder.shot(str(frame.frame_id), frame.pixels, place_now(), frame.host_time_ns)
             taken += 1
+
+
+def _triggered(camera: Camera) -> RawFrame:
+    """A frame whose exposure begins now; asked for once more where it was lost on its way."""
+    camera.trigger()
+    try:
+        return camera.read()
+    except CameraLost:
+        raise
+    except DeviceError:
+        camera.trigger()
+        return camera.read()
 
 
 def _live_place(rig: Rig, calibration: Calibration, stack: ExitStack) -> Callable[[], SE3 | None]:
